@@ -1,0 +1,1 @@
+"""AdaptGNS: a learned particle simulator whose interaction graph adapts to its uncertainty."""

@@ -1,0 +1,10 @@
+//! Interaction graphs for learned particle simulators, and the material point
+//! solver that makes their training data. No Python in here: the binding crate
+//! converts arguments and calls these functions.
+
+mod error;
+pub mod graph;
+pub mod mpm;
+pub mod threads;
+
+pub use error::Error;

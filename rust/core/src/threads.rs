@@ -1,0 +1,1 @@
+//! Thread pools that stay alive in forked processes.

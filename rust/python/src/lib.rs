@@ -1,0 +1,15 @@
+//! `adaptgns._core`: converts and validates arguments, releases the GIL, and calls
+//! the core crate. No algorithm lives here.
+
+mod errors;
+mod graph;
+mod mpm;
+
+use pyo3::prelude::*;
+
+/// Graph builders and the data generator of AdaptGNS.
+#[pymodule]
+fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    graph::register(module)?;
+    mpm::register(module)
+}
