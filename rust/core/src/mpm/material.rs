@@ -1,0 +1,206 @@
+//! Constitutive laws. All quantities are per unit of rest density, so that moduli are
+//! squared speeds [m²/s²] and the rest density is 1.
+
+use super::linalg::{self, Matrix};
+
+/// What a particle is made of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Material {
+    /// A weakly compressible liquid.
+    Water(Water),
+    /// A dry granular medium.
+    Sand(Sand),
+}
+
+/// How a material meets a wall. Both let go of a wall without resistance.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Contact {
+    /// The wall takes the velocity into it, nothing else.
+    Slip,
+    /// The wall also slows the sliding by this coefficient times the velocity taken
+    /// (Coulomb friction).
+    Friction(f64),
+}
+
+/// Tait's equation of state p = c²/γ ((ρ/ρ₀)^γ − 1), never in tension, with a
+/// Newtonian viscosity.
+///
+/// The density comes from the grid at the present positions instead of from the
+/// determinant of an integrated deformation: pressure is then a function of what a
+/// learned simulator sees, and errors cannot accumulate in the volume.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Water {
+    /// Speed of sound at rest density \[m/s\].
+    pub sound_speed: f64,
+    /// Exponent γ.
+    pub exponent: i32,
+    /// Kinematic viscosity \[m²/s\].
+    pub viscosity: f64,
+}
+
+/// Drucker–Prager plasticity on Hencky strains (Klár et al. 2016, section 6).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sand {
+    /// Lamé's first parameter \[m²/s²\].
+    pub lambda: f64,
+    /// Shear modulus \[m²/s²\].
+    pub mu: f64,
+    /// Angle of internal friction \[rad\].
+    pub friction_angle: f64,
+    /// Friction coefficient at the walls.
+    pub wall_friction: f64,
+}
+
+/// What a material remembers of a particle's past; water remembers nothing.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct History<const D: usize> {
+    /// Elastic left Cauchy–Green tensor b = F Fᵀ. Its eigenvectors are the left
+    /// singular vectors of F and its eigenvalues the squared singular values, which is
+    /// all that isotropic return mapping needs.
+    left_cauchy_green: Matrix<D>,
+    /// Logarithm of the volume gained while falling apart, given back before the
+    /// material bears load again (the volume correction of Klár et al.).
+    gained_volume: f64,
+}
+
+impl<const D: usize> History<D> {
+    pub(crate) fn at_rest() -> Self {
+        Self {
+            left_cauchy_green: linalg::identity(),
+            gained_volume: 0.0,
+        }
+    }
+}
+
+impl Material {
+    /// Whether [`Self::stress`] reads the density.
+    pub(crate) fn needs_density(&self) -> bool {
+        matches!(self, Self::Water(_))
+    }
+
+    /// Upper bound of the speed of sound \[m/s\] up to a compression of `density`.
+    pub(crate) fn sound_speed(&self, density: f64) -> f64 {
+        match self {
+            Self::Water(water) => {
+                water.sound_speed * density.max(1.0).powi(water.exponent - 1).sqrt()
+            }
+            Self::Sand(sand) => (sand.lambda + 2.0 * sand.mu).sqrt(),
+        }
+    }
+
+    pub(crate) fn contact(&self) -> Contact {
+        match self {
+            Self::Water(_) => Contact::Slip,
+            Self::Sand(sand) => Contact::Friction(sand.wall_friction),
+        }
+    }
+
+    /// Kirchhoff stress per unit of rest density \[m²/s²\], after the velocity gradient
+    /// has acted on the particle for the time `dt`.
+    pub(crate) fn stress<const D: usize>(
+        &self,
+        history: &mut History<D>,
+        velocity_gradient: &Matrix<D>,
+        dt: f64,
+        density: f64,
+    ) -> Matrix<D> {
+        match self {
+            Self::Water(water) => water.stress(velocity_gradient, density),
+            Self::Sand(sand) => sand.stress(history, velocity_gradient, dt),
+        }
+    }
+
+    /// Stored elastic energy per mass \[m²/s²\].
+    pub(crate) fn energy<const D: usize>(&self, history: &History<D>, density: f64) -> f64 {
+        match self {
+            Self::Water(water) => water.energy(density),
+            Self::Sand(sand) => sand.energy(history),
+        }
+    }
+}
+
+impl Water {
+    fn stress<const D: usize>(&self, velocity_gradient: &Matrix<D>, density: f64) -> Matrix<D> {
+        let modulus = self.sound_speed.powi(2) / f64::from(self.exponent);
+        let pressure = modulus * (density.max(1.0).powi(self.exponent) - 1.0);
+        // Kirchhoff stress is Cauchy stress times the ratio of present to rest volume.
+        let pressure = pressure / density;
+        let expansion = linalg::trace(velocity_gradient) / D as f64;
+        let mut stress = linalg::zero();
+        for i in 0..D {
+            for j in 0..D {
+                stress[i][j] = self.viscosity * (velocity_gradient[i][j] + velocity_gradient[j][i]);
+            }
+            stress[i][i] -= 2.0 * self.viscosity * expansion + pressure;
+        }
+        stress
+    }
+
+    /// ∫ p/ρ² dρ from rest.
+    fn energy(&self, density: f64) -> f64 {
+        let density = density.max(1.0);
+        let exponent = f64::from(self.exponent);
+        let modulus = self.sound_speed.powi(2) / exponent;
+        modulus * ((density.powi(self.exponent - 1) - 1.0) / (exponent - 1.0) + 1.0 / density - 1.0)
+    }
+}
+
+impl Sand {
+    fn stress<const D: usize>(
+        &self,
+        history: &mut History<D>,
+        velocity_gradient: &Matrix<D>,
+        dt: f64,
+    ) -> Matrix<D> {
+        let mut step = linalg::identity();
+        for i in 0..D {
+            for j in 0..D {
+                step[i][j] += dt * velocity_gradient[i][j];
+            }
+        }
+        let trial = linalg::congruence(&step, &history.left_cauchy_green);
+        let (squares, axes) = linalg::symmetric_eigen(&trial);
+        let trial: [f64; D] = squares.map(|square| 0.5 * square.max(f64::MIN_POSITIVE).ln());
+        let strain = self.project(trial, &mut history.gained_volume);
+        history.left_cauchy_green =
+            linalg::congruence(&axes, &linalg::diagonal(&strain.map(|e| (2.0 * e).exp())));
+        let volumetric: f64 = self.lambda * strain.iter().sum::<f64>();
+        linalg::congruence(
+            &axes,
+            &linalg::diagonal(&strain.map(|e| volumetric + 2.0 * self.mu * e)),
+        )
+    }
+
+    /// Return mapping of principal Hencky strains to the Drucker–Prager cone: what
+    /// expands falls apart, what is sheared beyond friction slides without changing
+    /// its volume.
+    fn project<const D: usize>(&self, trial: [f64; D], gained_volume: &mut f64) -> [f64; D] {
+        let dimension = D as f64;
+        let expansion = trial.iter().sum::<f64>() + *gained_volume;
+        if expansion >= 0.0 {
+            *gained_volume = expansion;
+            return [0.0; D];
+        }
+        let mean = (expansion - *gained_volume) / dimension;
+        *gained_volume = 0.0;
+        let deviator = trial.map(|e| e - mean);
+        let shear = linalg::dot(&deviator, &deviator).sqrt();
+        let sine = self.friction_angle.sin();
+        let slope = (2.0_f64 / 3.0).sqrt() * 2.0 * sine / (3.0 - sine);
+        let bearable =
+            -slope * expansion * (dimension * self.lambda + 2.0 * self.mu) / (2.0 * self.mu);
+        let scale = if shear > bearable {
+            bearable / shear
+        } else {
+            1.0
+        };
+        deviator.map(|e| expansion / dimension + scale * e)
+    }
+
+    fn energy<const D: usize>(&self, history: &History<D>) -> f64 {
+        let (squares, _) = linalg::symmetric_eigen(&history.left_cauchy_green);
+        let strain = squares.map(|square| 0.5 * square.ln());
+        let volumetric: f64 = strain.iter().sum();
+        self.mu * linalg::dot(&strain, &strain) + 0.5 * self.lambda * volumetric.powi(2)
+    }
+}
