@@ -36,9 +36,6 @@ impl<const D: usize> Stencil<D> {
 
 pub(crate) struct Grid<const D: usize> {
     pub nodes: Vec<Node<D>>,
-    /// Reciprocal of the volume of each node's spline that lies inside the walls, so
-    /// that mass over volume is unbiased next to a wall.
-    pub inverse_volume: Vec<f64>,
     pub spacing: f64,
     walls: Walls,
     cells: usize,
@@ -60,18 +57,8 @@ impl<const D: usize> Grid<D> {
             mass: 0.0,
             velocity: [0.0; D],
         };
-        let inverse_volume = (0..side.pow(D as u32))
-            .map(|index| {
-                let volume: f64 = strides
-                    .iter()
-                    .map(|stride| spacing * inside_fraction(index / stride % side, cells))
-                    .product();
-                1.0 / volume
-            })
-            .collect();
         Self {
             nodes: vec![empty; side.pow(D as u32)],
-            inverse_volume,
             spacing,
             walls,
             cells,
@@ -185,17 +172,5 @@ impl<const D: usize> Grid<D> {
         } else {
             0.0
         }
-    }
-}
-
-/// Part of the spline of the node `index` along one axis that lies between the walls:
-/// the spline's integral from -∞ to the wall at distance 1, 0 or -1.
-fn inside_fraction(index: usize, cells: usize) -> f64 {
-    let from_wall = index.min(cells + 2 * PADDING - index);
-    match from_wall {
-        0 => 1.0 / 48.0,
-        1 => 0.5,
-        2 => 47.0 / 48.0,
-        _ => 1.0,
     }
 }

@@ -22,20 +22,20 @@ pub enum Contact {
     Friction(f64),
 }
 
-/// Tait's equation of state p = c²/γ ((ρ/ρ₀)^γ − 1), never in tension, with a
-/// Newtonian viscosity.
-///
-/// The density comes from the grid at the present positions instead of from the
-/// determinant of an integrated deformation: pressure is then a function of what a
-/// learned simulator sees, and errors cannot accumulate in the volume.
+/// Tait's equation of state p = c²/γ ((ρ/ρ₀)^γ − 1), with little tension and a Newtonian
+/// viscosity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Water {
     /// Speed of sound at rest density \[m/s\].
     pub sound_speed: f64,
     /// Exponent γ.
-    pub exponent: i32,
+    pub exponent: f64,
     /// Kinematic viscosity \[m²/s\].
     pub viscosity: f64,
+    /// Largest expansion, as a logarithm of volume, up to which water holds together.
+    pub cohesion: f64,
+    /// x
+    pub torn: f64,
 }
 
 /// Drucker–Prager plasticity on Hencky strains (Klár et al. 2016, section 6).
@@ -51,38 +51,35 @@ pub struct Sand {
     pub wall_friction: f64,
 }
 
-/// What a material remembers of a particle's past; water remembers nothing.
+/// What a material remembers of a particle's past.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct History<const D: usize> {
-    /// Elastic left Cauchy–Green tensor b = F Fᵀ. Its eigenvectors are the left
+    /// Sand: elastic left Cauchy–Green tensor b = F Fᵀ. Its eigenvectors are the left
     /// singular vectors of F and its eigenvalues the squared singular values, which is
     /// all that isotropic return mapping needs.
     left_cauchy_green: Matrix<D>,
-    /// Logarithm of the volume gained while falling apart, given back before the
-    /// material bears load again (the volume correction of Klár et al.).
-    gained_volume: f64,
+    /// Logarithm of the volume over the volume at rest. Sand: of the part gained while
+    /// falling apart, which is given back before the material bears load again (the
+    /// volume correction of Klár et al.).
+    log_volume: f64,
 }
 
 impl<const D: usize> History<D> {
     pub(crate) fn at_rest() -> Self {
         Self {
             left_cauchy_green: linalg::identity(),
-            gained_volume: 0.0,
+            log_volume: 0.0,
         }
     }
 }
 
 impl Material {
-    /// Whether [`Self::stress`] reads the density.
-    pub(crate) fn needs_density(&self) -> bool {
-        matches!(self, Self::Water(_))
-    }
-
-    /// Upper bound of the speed of sound \[m/s\] up to a compression of `density`.
-    pub(crate) fn sound_speed(&self, density: f64) -> f64 {
+    /// Speed of sound \[m/s\] in a particle.
+    pub(crate) fn sound_speed<const D: usize>(&self, history: &History<D>) -> f64 {
         match self {
             Self::Water(water) => {
-                water.sound_speed * density.max(1.0).powi(water.exponent - 1).sqrt()
+                let compression = (-history.log_volume).max(0.0);
+                water.sound_speed * (0.5 * (water.exponent - 1.0) * compression).exp()
             }
             Self::Sand(sand) => (sand.lambda + 2.0 * sand.mu).sqrt(),
         }
@@ -102,46 +99,56 @@ impl Material {
         history: &mut History<D>,
         velocity_gradient: &Matrix<D>,
         dt: f64,
-        density: f64,
     ) -> Matrix<D> {
         match self {
-            Self::Water(water) => water.stress(velocity_gradient, density),
+            Self::Water(water) => water.stress(history, velocity_gradient, dt),
             Self::Sand(sand) => sand.stress(history, velocity_gradient, dt),
         }
     }
 
     /// Stored elastic energy per mass \[m²/s²\].
-    pub(crate) fn energy<const D: usize>(&self, history: &History<D>, density: f64) -> f64 {
+    pub(crate) fn energy<const D: usize>(&self, history: &History<D>) -> f64 {
         match self {
-            Self::Water(water) => water.energy(density),
+            Self::Water(water) => water.energy(history.log_volume),
             Self::Sand(sand) => sand.energy(history),
         }
     }
 }
 
 impl Water {
-    fn stress<const D: usize>(&self, velocity_gradient: &Matrix<D>, density: f64) -> Matrix<D> {
-        let modulus = self.sound_speed.powi(2) / f64::from(self.exponent);
-        let pressure = modulus * (density.max(1.0).powi(self.exponent) - 1.0);
-        // Kirchhoff stress is Cauchy stress times the ratio of present to rest volume.
-        let pressure = pressure / density;
-        let expansion = linalg::trace(velocity_gradient) / D as f64;
+    fn stress<const D: usize>(
+        &self,
+        history: &mut History<D>,
+        velocity_gradient: &Matrix<D>,
+        dt: f64,
+    ) -> Matrix<D> {
+        let divergence = linalg::trace(velocity_gradient);
+        history.log_volume = (history.log_volume + dt * divergence).min(self.torn);
+        let log_volume = history.log_volume.min(self.cohesion);
+        let modulus = self.sound_speed.powi(2) / self.exponent;
+        let pressure = modulus * ((-self.exponent * log_volume).exp() - 1.0);
+        // Kirchhoff stress is Cauchy stress times the volume ratio.
+        let volume = history.log_volume.exp();
         let mut stress = linalg::zero();
         for i in 0..D {
             for j in 0..D {
-                stress[i][j] = self.viscosity * (velocity_gradient[i][j] + velocity_gradient[j][i]);
+                stress[i][j] =
+                    volume * self.viscosity * (velocity_gradient[i][j] + velocity_gradient[j][i]);
             }
-            stress[i][i] -= 2.0 * self.viscosity * expansion + pressure;
+            stress[i][i] -= volume * (2.0 / D as f64 * self.viscosity * divergence + pressure);
         }
         stress
     }
 
-    /// ∫ p/ρ² dρ from rest.
-    fn energy(&self, density: f64) -> f64 {
-        let density = density.max(1.0);
-        let exponent = f64::from(self.exponent);
-        let modulus = self.sound_speed.powi(2) / exponent;
-        modulus * ((density.powi(self.exponent - 1) - 1.0) / (exponent - 1.0) + 1.0 / density - 1.0)
+    /// −∫ p dV from rest.
+    fn energy(&self, log_volume: f64) -> f64 {
+        let held = log_volume.min(self.cohesion);
+        let modulus = self.sound_speed.powi(2) / self.exponent;
+        let compression = ((1.0 - self.exponent) * held).exp() - 1.0;
+        let tension = 1.0 - (-self.exponent * self.cohesion).exp();
+        modulus
+            * (compression / (self.exponent - 1.0) + held.exp() - 1.0
+                + tension * (log_volume.exp() - held.exp()))
     }
 }
 
@@ -161,7 +168,7 @@ impl Sand {
         let trial = linalg::congruence(&step, &history.left_cauchy_green);
         let (squares, axes) = linalg::symmetric_eigen(&trial);
         let trial: [f64; D] = squares.map(|square| 0.5 * square.max(f64::MIN_POSITIVE).ln());
-        let strain = self.project(trial, &mut history.gained_volume);
+        let strain = self.project(trial, &mut history.log_volume);
         history.left_cauchy_green =
             linalg::congruence(&axes, &linalg::diagonal(&strain.map(|e| (2.0 * e).exp())));
         let volumetric: f64 = self.lambda * strain.iter().sum::<f64>();
@@ -174,15 +181,15 @@ impl Sand {
     /// Return mapping of principal Hencky strains to the Drucker–Prager cone: what
     /// expands falls apart, what is sheared beyond friction slides without changing
     /// its volume.
-    fn project<const D: usize>(&self, trial: [f64; D], gained_volume: &mut f64) -> [f64; D] {
+    fn project<const D: usize>(&self, trial: [f64; D], log_volume: &mut f64) -> [f64; D] {
         let dimension = D as f64;
-        let expansion = trial.iter().sum::<f64>() + *gained_volume;
+        let expansion = trial.iter().sum::<f64>() + *log_volume;
         if expansion >= 0.0 {
-            *gained_volume = expansion;
+            *log_volume = expansion;
             return [0.0; D];
         }
-        let mean = (expansion - *gained_volume) / dimension;
-        *gained_volume = 0.0;
+        let mean = (expansion - *log_volume) / dimension;
+        *log_volume = 0.0;
         let deviator = trial.map(|e| e - mean);
         let shear = linalg::dot(&deviator, &deviator).sqrt();
         let sine = self.friction_angle.sin();

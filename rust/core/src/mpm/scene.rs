@@ -135,8 +135,10 @@ impl Scene {
             Self::WaterDrop => Recipe {
                 material: Material::Water(Water {
                     sound_speed: knob("C", 20.0),
-                    exponent: 7,
+                    exponent: 7.0,
                     viscosity: knob("VISC", 0.001),
+                    cohesion: knob("TENS", 0.01),
+                    torn: knob("TORN", 0.1),
                 }),
                 particle_type: 5,
                 spacing: [knob("SP", 0.0106), 0.025],

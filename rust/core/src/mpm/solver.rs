@@ -21,7 +21,6 @@ struct Particle<const D: usize> {
     velocity: [f64; D],
     velocity_gradient: Matrix<D>,
     history: History<D>,
-    density: f64,
 }
 
 /// Particles of one material in a box, after Hu et al., "A moving least squares material
@@ -61,7 +60,6 @@ impl<const D: usize> Simulation<D> {
                 velocity,
                 velocity_gradient: linalg::zero(),
                 history: History::at_rest(),
-                density: 1.0,
             })
             .collect();
         let mut simulation = Self {
@@ -78,12 +76,12 @@ impl<const D: usize> Simulation<D> {
 
     /// Advances by [`FRAME_TIME`].
     pub fn advance_frame(&mut self) {
-        let (mut fastest, mut densest) = (0.0_f64, 1.0_f64);
+        let (mut fastest, mut sound) = (0.0_f64, 0.0_f64);
         for particle in &self.particles {
             fastest = fastest.max(linalg::dot(&particle.velocity, &particle.velocity));
-            densest = densest.max(particle.density);
+            sound = sound.max(self.material.sound_speed(&particle.history));
         }
-        let speed = fastest.sqrt() + self.material.sound_speed(densest);
+        let speed = fastest.sqrt() + sound;
         let steps = (FRAME_TIME * speed / (COURANT * self.grid.spacing)).ceil();
         self.change_step(FRAME_TIME / steps);
         for _ in 0..steps as usize {
@@ -133,7 +131,7 @@ impl<const D: usize> Simulation<D> {
                 0.5 * linalg::dot(&velocity, &velocity)
                     + 0.5 * inertia * spin
                     + GRAVITY * (particle.position[1] - self.walls.low)
-                    + self.material.energy(&particle.history, particle.density)
+                    + self.material.energy(&particle.history)
             })
             .sum::<f64>()
             * self.particle_mass
@@ -152,38 +150,10 @@ impl<const D: usize> Simulation<D> {
     fn advance_step(&mut self) {
         self.grid
             .cover(self.particles.iter().map(|particle| &particle.position));
-        if self.material.needs_density() {
-            self.measure_density();
-        }
         self.scatter();
         self.update_grid();
         self.gather();
         self.keep_inside();
-    }
-
-    /// Density at every particle: the average of the grid's density, weighted by where
-    /// the mass is. Weighting by mass instead of volume keeps a free surface from
-    /// appearing half empty.
-    fn measure_density(&mut self) {
-        let grid = &mut self.grid;
-        for particle in &self.particles {
-            let stencil = grid.stencil(&particle.position);
-            for k in 0..Stencil::<D>::LEN {
-                grid.nodes[stencil.nodes[k]].mass += stencil.weights[k] * self.particle_mass;
-            }
-        }
-        for particle in &mut self.particles {
-            let stencil = grid.stencil(&particle.position);
-            let (mut weighted, mut total) = (0.0, 0.0);
-            for k in 0..Stencil::<D>::LEN {
-                let node = stencil.nodes[k];
-                let mass = stencil.weights[k] * grid.nodes[node].mass;
-                weighted += mass * grid.nodes[node].mass * grid.inverse_volume[node];
-                total += mass;
-            }
-            particle.density = weighted / total;
-        }
-        grid.for_each_row(|row, _| row.iter_mut().for_each(|node| node.mass = 0.0));
     }
 
     fn scatter(&mut self) {
@@ -194,7 +164,6 @@ impl<const D: usize> Simulation<D> {
                 &mut particle.history,
                 &particle.velocity_gradient,
                 self.step,
-                particle.density,
             );
             let mut affine = particle.velocity_gradient;
             for i in 0..D {
