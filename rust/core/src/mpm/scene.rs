@@ -134,20 +134,20 @@ impl Scene {
         match self {
             Self::WaterDrop => Recipe {
                 material: Material::Water(Water {
-                    sound_speed: knob("C", 20.0),
+                    sound_speed: knob("C", 14.0),
                     exponent: 7.0,
-                    viscosity: knob("VISC", 0.001),
+                    viscosity: knob("VISC", 0.003),
                     cohesion: knob("TENS", 0.01),
-                    torn: knob("TORN", 0.1),
+                    torn: knob("TORN", 0.5),
                 }),
                 particle_type: 5,
-                spacing: [knob("SP", 0.0106), 0.025],
+                spacing: [knob("SP", 0.0102), 0.025],
                 coarseness: knob("COARSE", 1.9),
-                jitter: knob("JIT", 0.4),
+                jitter: knob("JIT", 0.45),
                 particles: [(220, 914), (1000, 6000)],
                 blocks: &[0.8, 0.2],
                 aspect: 1.6,
-                speed: knob("SPEED", 1.0),
+                speed: knob("SPEED", 0.5),
             },
             Self::Sand => Recipe {
                 material: Material::Sand(Sand {
@@ -159,7 +159,7 @@ impl Scene {
                 particle_type: 6,
                 spacing: [knob("SP", 0.0098), 0.025],
                 coarseness: knob("COARSE", 2.0),
-                jitter: knob("JIT", 0.4),
+                jitter: knob("JIT", 0.45),
                 particles: [(400, 2140), (2000, 8000)],
                 blocks: &[0.4, 0.3, 0.3],
                 aspect: 2.0,
