@@ -113,7 +113,8 @@ def clumping(
     denser than in truth the predicted cloud is. NaN where the true graph has no edge.
     """
     ratio = np.full(len(true_edges), np.nan)
-    return np.divide(predicted_edges, true_edges, out=ratio, where=true_edges > 0)
+    np.divide(predicted_edges, true_edges, out=ratio, where=true_edges > 0)
+    return ratio
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ def spearman(first: Floats, second: Floats) -> float:
 def _average_ranks(values: Floats) -> NDArray[np.float64]:
     """``[n]`` ranks counted from 1, equal values sharing their mean."""
     _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-    # The c equal values that end at rank e have the ranks e - c + 1 … e, e - (c - 1) / 2 on average.
+    # c equal values that end at rank e have the ranks e - c + 1 … e: on average e - (c - 1) / 2.
     average = counts.cumsum() - (counts - 1) / 2
     ranks: NDArray[np.float64] = average[inverse]
     return ranks

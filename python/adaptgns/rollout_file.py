@@ -157,7 +157,8 @@ class RolloutWriter:
         _create(group, "initial", trajectory.positions[:HISTORY])
         _create(group, "particle_type", trajectory.particle_type)
         count = 0
-        for count, step in enumerate(steps, start=1):
+        for step in steps:
+            count += 1
             _append(group, "predicted", step.positions)
             _append(group, "edges", step.edges)
             _append(group, "graph_ms", step.graph_ms)
@@ -260,7 +261,7 @@ class OneStep:
     squared_error: NDArray[np.float32]
     """``[M, N]`` of the acceleration, summed over dimensions, normalized units"""
     variance: NDArray[np.float32] | None
-    """``[M, N]`` predicted variance per dimension, normalized units; None without a variance head"""
+    """``[M, N]`` predicted variance per dimension, normalized units; None without a head for it"""
 
 
 class RolloutFile:
