@@ -119,8 +119,8 @@ class TrainConfig:
     0: the weights themselves."""
     noise: float = 6.7e-4
     """Std of the random-walk noise on the last input velocity (length per frame)."""
-    noise_varies: bool = False
-    """Draw each sample's noise std uniformly between 0 and noise."""
+    noise_spread: float = 1.0
+    """Draw each sample's noise std log-uniformly between noise and this many times it."""
     mirror: bool = False
     """Reflect every other sample along the first axis (for physics that is symmetric there)."""
     seed: int = 0

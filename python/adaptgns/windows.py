@@ -110,7 +110,7 @@ class Windows(Dataset[Sample]):
         mobile = self.mobile(window.particle_type)
         if self.config.mirror and rng.random() < 0.5:
             positions[..., 0] = np.float32(sum(self.metadata.bounds[0])) - positions[..., 0]
-        std = self.noise * (rng.random() if self.config.noise_varies else 1.0)
+        std = self.noise * self.config.noise_spread ** rng.random()
         if std > 0:
             walk = random_walk_noise(rng, HISTORY, positions.shape[1], positions.shape[2], std)
             walk *= mobile[:, None]
