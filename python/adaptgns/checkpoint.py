@@ -8,7 +8,6 @@ weights where the run keeps one; ``optimizer.*`` in the files that training goes
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from adaptgns.atomic import written_whole
 from adaptgns.config import TrainConfig, from_json, to_json
 from adaptgns.data.metadata import Metadata
 from adaptgns.simulator import Simulator
@@ -74,21 +74,8 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "step": str(checkpoint.step),
         "best_score": repr(checkpoint.best_score),
     }
-    write_atomically(path, save(checkpoint.tensors, header))
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a reader sees the old or the new content, never a part of it."""
-    partial = path.with_name(f"{path.name}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    with written_whole(path) as partial:
+        partial.write_bytes(save(checkpoint.tensors, header))
 
 
 def read_checkpoint(path: Path, *, device: str = "cpu") -> Checkpoint:

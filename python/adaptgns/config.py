@@ -121,6 +121,8 @@ class TrainConfig:
     """Std of the random-walk noise on the last input velocity (length per frame)."""
     noise_spread: float = 1.0
     """Draw each sample's noise std log-uniformly between noise and this many times it."""
+    position_correction: float = 0.0
+    """Share of the last position's noise that the target undoes in one frame; 0: none, as GNS."""
     mirror: bool = False
     """Reflect every other sample along the first axis (for physics that is symmetric there)."""
     seed: int = 0

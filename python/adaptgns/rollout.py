@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -159,22 +158,21 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
             frames = len(trajectory.positions) - HISTORY
             horizon = frames if config.steps is None else min(config.steps, frames)
 
-            def roll(teacher_forcing: bool) -> list[Step]:
+            def roll(teacher_forcing: bool) -> Iterator[Step]:
                 policy = make_policy(
                     config.policy, config.adaptive, k=config.k, seed=config.seed + index
                 )
-                return list(
-                    steps(
-                        simulator,
-                        trajectory,
-                        policy,
-                        horizon,
-                        radius=config.radius,
-                        teacher_forcing=teacher_forcing,
-                    )
+                return steps(
+                    simulator,
+                    trajectory,
+                    policy,
+                    horizon,
+                    radius=config.radius,
+                    teacher_forcing=teacher_forcing,
                 )
 
-            writer.add(trajectory, roll(False), roll(True)[:: config.one_step_every])
+            one_step = islice(enumerate(roll(True), start=HISTORY), 0, None, config.one_step_every)
+            writer.add(trajectory, roll(False), one_step)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -12,7 +12,8 @@ import torch
 import tyro
 from rich.console import Console
 
-from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint, write_atomically
+from adaptgns.atomic import written_whole
+from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint
 from adaptgns.config import PolicyName, RolloutConfig, TrainConfig, from_json, to_json
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
@@ -83,7 +84,8 @@ def train(config: TrainConfig, console: Console) -> Path:
     data = default_dataset(config.data) if config.data in EMBEDDED else Path(config.data)
     metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / CONFIG, json.dumps(to_json(config), indent=1).encode())
+    with written_whole(folder / CONFIG) as partial:
+        partial.write_text(json.dumps(to_json(config), indent=1))
     trainer = Trainer(
         config, metadata, folder, open_split(data, "train"), open_split(data, "valid"), checkpoint
     )

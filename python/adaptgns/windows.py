@@ -116,8 +116,8 @@ class Windows(Dataset[Sample]):
             walk *= mobile[:, None]
             positions[-HISTORY - 1 : -1] += walk
             # The following position moves along, so that the target undoes the noise of the last
-            # velocity but not that of the last position.
-            positions[-1] += walk[-1]
+            # velocity and of that of the last position only the share asked for.
+            positions[-1] += walk[-1] * np.float32(1 - self.config.position_correction)
         return Sample(positions, window.particle_type, window.material_property)
 
     def mobile(self, particle_type: NDArray[np.int64]) -> NDArray[np.bool_]:

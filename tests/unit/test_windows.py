@@ -121,3 +121,13 @@ def test_noise_spreads_over_its_range(windows: Windows) -> None:
         stds.append(np.diff(noise[:6], axis=0)[-1].std())
     assert 2e-4 < min(stds) < 5e-4
     assert 9e-4 < max(stds) < 1.8e-3
+
+
+def test_position_correction_undoes_its_share(windows: Windows) -> None:
+    config = replace(windows.config, position_correction=0.25)
+    corrected = Windows(windows.trajectories, windows.metadata, config, noise=3e-4)[0, 5].positions
+    plain = windows[0, 5].positions
+    clean = Windows(windows.trajectories, windows.metadata, config, noise=0.0)[0, 5].positions
+    np.testing.assert_array_equal(corrected[:-1], plain[:-1])
+    noise = plain[-2] - clean[-2]
+    np.testing.assert_allclose(corrected[-1] - clean[-1], 0.75 * noise, atol=1e-7)
