@@ -14,21 +14,13 @@ import numpy.typing as npt
 
 from adaptgns.data.atomic import replace_text
 from adaptgns.data.errors import DataError, DataWarning
-from adaptgns.data.statistics import MotionStatistics, compute_statistics
+from adaptgns.data.statistics import FILE_KEYS, MotionStatistics, compute_statistics
 from adaptgns.data.trajectories import SPLITS, find_split, open_split
 
 FILE_NAME = "metadata.json"
 
 GNS_KINEMATIC = (3,)
 LAGRANGEBENCH_KINEMATIC = (1, 2)
-
-_STATISTICS = {
-    "velocity_mean": "vel_mean",
-    "velocity_std": "vel_std",
-    "acceleration_mean": "acc_mean",
-    "acceleration_std": "acc_std",
-}
-"""Our names and those that GNS and LagrangeBench both use in the file."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +53,7 @@ class Metadata:
 
     def __post_init__(self) -> None:
         _check_geometry(self.dim, self.dt, self.bounds, self.periodic, self.radius)
-        for ours, key in _STATISTICS.items():
+        for ours, key in FILE_KEYS.items():
             _check_statistic(key, getattr(self, ours), self.dim)
 
     @property
@@ -105,7 +97,7 @@ def read_metadata(folder: Path) -> Metadata:
         metadata = _parse(section, folder)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
-    missing = [key for key in _STATISTICS.values() if key not in section]
+    missing = [key for key in FILE_KEYS.values() if key not in section]
     if missing:
         _write_back(path, content, metadata)
     return metadata
@@ -154,9 +146,9 @@ def _parse(section: dict[str, Any], folder: Path) -> Metadata:
     _check_geometry(dim, dt, bounds, periodic, radius)
     kinematic = _kinematic_types(section)
     statistics = {
-        ours: tuple(_list(section, key)) for ours, key in _STATISTICS.items() if key in section
+        ours: tuple(_list(section, key)) for ours, key in FILE_KEYS.items() if key in section
     }
-    if len(statistics) < len(_STATISTICS):
+    if len(statistics) < len(FILE_KEYS):
         statistics = asdict(_compute(folder, bounds, periodic, kinematic)) | statistics
     return Metadata(
         dim=dim,
@@ -189,7 +181,7 @@ def _write_back(path: Path, content: dict[str, Any], metadata: Metadata) -> None
     """Adds the statistics that were missing to each section of the file."""
     sections = [value for value in (content.get("train"), content.get("rollout")) if value]
     for section in sections or [content]:
-        for ours, key in _STATISTICS.items():
+        for ours, key in FILE_KEYS.items():
             section.setdefault(key, list(getattr(metadata, ours)))
     try:
         write_metadata(path.parent, content)

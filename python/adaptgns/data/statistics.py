@@ -15,6 +15,14 @@ if TYPE_CHECKING:
 
     from adaptgns.data.trajectories import Trajectories
 
+FILE_KEYS = {
+    "velocity_mean": "vel_mean",
+    "velocity_std": "vel_std",
+    "acceleration_mean": "acc_mean",
+    "acceleration_std": "acc_std",
+}
+"""Our names and those that GNS and LagrangeBench both use in `metadata.json`."""
+
 _BLOCK_VALUES = 1 << 22
 """Positions held in float64 at a time: 32 MiB, however long a trajectory is."""
 
@@ -30,6 +38,10 @@ class MotionStatistics:
     velocity_std: tuple[float, ...]
     acceleration_mean: tuple[float, ...]
     acceleration_std: tuple[float, ...]
+
+    def to_file_keys(self) -> dict[str, list[float]]:
+        """The moments under the names they have in `metadata.json`."""
+        return {key: list(getattr(self, name)) for name, key in FILE_KEYS.items()}
 
 
 class _Moments:

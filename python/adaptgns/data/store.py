@@ -3,180 +3,123 @@
 One group per trajectory (`00000`, `00001`, ...) with `position` float32 `[T, N, d]`,
 `particle_type` `[N]` and optionally `material_property` `[N]` or `[N, P]`. Files written here
 keep positions contiguous and uncompressed, so that a window of frames is one read at a known
-offset; LagrangeBench's own are compressed in chunks.
+offset; LagrangeBench's own are compressed in chunks, and read just as well.
 """
 
 from __future__ import annotations
 
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
-import numpy as np
-import numpy.typing as npt
 
-from adaptgns.data.cache import CACHE_BYTES, TrajectoryCache
+from adaptgns.data.atomic import publish
 from adaptgns.data.errors import DataError
 from adaptgns.data.trajectory import (
     Shape,
     Trajectory,
+    check_finite,
+    check_shape,
     check_type_range,
-    material_properties,
     particle_types,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
+    from collections.abc import Iterable
+    from types import TracebackType
 
-_PADDING = -1
-"""LagrangeBench's particle type for rows that only fill up an array."""
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A trajectory's place in the file and everything of it but the positions."""
-
-    group: str
-    shape: tuple[int, int, int]
-    dtype: np.dtype[Any]
-    offset: int | None
-    real: npt.NDArray[np.bool_] | None
-    particle_type: npt.NDArray[np.int64]
-    material_property: npt.NDArray[np.float32] | None
-
-    @property
-    def nbytes(self) -> int:
-        return int(np.prod(self.shape)) * self.dtype.itemsize
+_ORIGIN = "adaptgns_origin"
+"""Attribute of the file that says what made it; other readers don't look at it."""
 
 
-class StoreSource:
-    """Trajectories of one HDF5 file; no handle is held between reads.
+class StoreWriter:
+    """Streams trajectories into one HDF5 file, which gets its name only once it is whole.
 
-    Contiguous positions are read straight from their offset, which costs one system call and
-    needs no HDF5 library state (safe after a fork, and in threads). Chunked ones are read whole
-    and kept, or frame by frame where one trajectory exceeds the cache.
+    Used as a context manager: leaving it normally publishes the file; leaving it by an exception
+    removes what was written. A killed process leaves only `partial_path(path)` behind.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with self._file() as file:
-            self._entries = [self._entry(file, name) for name in sorted(file)]
-        self.shapes = tuple(
-            Shape(entry.group, entry.shape[0], len(entry.particle_type), entry.shape[2])
-            for entry in self._entries
-        )
-        self._cache = TrajectoryCache(self._load)
+    def __init__(self, path: Path, *, origin: str | None = None) -> None:
+        """Starts a file.
 
-    def read(self, index: int, start: int, stop: int) -> Trajectory:
-        entry = self._entries[index]
-        if entry.offset is not None:
-            positions = self._read_contiguous(entry, start, stop)
-        elif entry.nbytes <= CACHE_BYTES:
-            positions = self._cache[index].positions[start:stop].copy()
-        else:
-            positions = self._read_chunked(entry, start, stop)
-        material = entry.material_property
-        return Trajectory(
-            name=entry.group,
-            positions=positions,
-            particle_type=entry.particle_type.copy(),
-            material_property=None if material is None else material.copy(),
-        )
-
-    def material_properties(self) -> int:
-        material = self._entries[0].material_property
-        return 0 if material is None else material.shape[1]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_cache"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._cache = TrajectoryCache(self._load)
-
-    @contextmanager
-    def _file(self) -> Iterator[h5py.File]:
+        Args:
+            path: where the finished file goes; replaced if it exists.
+            origin: what made the data, to be read back by `read_origin`.
+        """
+        self.path = Path(path)
+        self._partial = partial_path(self.path)
+        self._written = 0
         try:
-            with h5py.File(self.path, "r") as file:
-                yield file
-        except DataError:
-            raise
-        except FileNotFoundError:
-            raise DataError(f"{self.path}: there is no such file") from None
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise DataError(f"{self.path}: damaged, truncated or not HDF5: {error}") from error
-
-    def _entry(self, file: h5py.File, group: str) -> _Entry:
-        where = f"{self.path}: trajectory {group}"
-        members = file[group]
-        if not isinstance(members, h5py.Group):
-            raise DataError(f"{where}: a data set; a group per trajectory is accepted")
-        for required in ("position", "particle_type"):
-            if not isinstance(members.get(required), h5py.Dataset):
-                raise DataError(f"{where}: no {required}; the group holds {sorted(members)}")
-        position = members["position"]
-        if position.ndim != 3 or position.dtype.kind != "f":
-            raise DataError(
-                f"{where}: position has shape {list(position.shape)} and dtype {position.dtype}; "
-                "floating [T, N, d] is accepted"
-            )
-        particles = position.shape[1]
-        types = particle_types(members["particle_type"][()], particles, where)
-        material = None
-        if "material_property" in members:
-            material = material_properties(members["material_property"][()], particles, where)
-        real = types != _PADDING
-        if not real.all():
-            types = types[real]
-            material = None if material is None else material[real]
-        check_type_range(types, where)
-        entry = _Entry(
-            group=group,
-            shape=position.shape,
-            dtype=position.dtype,
-            offset=position.id.get_offset(),
-            real=None if real.all() else real,
-            particle_type=types,
-            material_property=material,
-        )
-        if entry.offset is not None and entry.offset + entry.nbytes > self.path.stat().st_size:
-            raise DataError(f"{where}: the file ends before its positions do; it is truncated")
-        return entry
-
-    def _load(self, index: int) -> Trajectory:
-        entry = self._entries[index]
-        positions = self._read_chunked(entry, 0, entry.shape[0])
-        return Trajectory(entry.group, positions, entry.particle_type, entry.material_property)
-
-    def _read_contiguous(self, entry: _Entry, start: int, stop: int) -> npt.NDArray[np.float32]:
-        _, particles, dim = entry.shape
-        per_frame = particles * dim
-        assert entry.offset is not None
-        try:
-            flat = np.fromfile(
-                self.path,
-                dtype=entry.dtype,
-                count=(stop - start) * per_frame,
-                offset=entry.offset + start * per_frame * entry.dtype.itemsize,
-            )
+            self._file = h5py.File(self._partial, "w")
         except OSError as error:
-            raise DataError(f"{self.path}: trajectory {entry.group}: {error}") from error
-        if flat.size != (stop - start) * per_frame:
-            raise DataError(
-                f"{self.path}: trajectory {entry.group}: frame {start + flat.size // per_frame}: "
-                "the file ends here; it is truncated"
-            )
-        return _clean(flat.reshape(stop - start, particles, dim), entry)
+            raise DataError(f"{self._partial}: can't be created: {error}") from error
+        if origin is not None:
+            self._file.attrs[_ORIGIN] = origin
 
-    def _read_chunked(self, entry: _Entry, start: int, stop: int) -> npt.NDArray[np.float32]:
-        with self._file() as file:
-            return _clean(file[entry.group]["position"][start:stop], entry)
+    def append(self, trajectory: Trajectory) -> None:
+        """Adds a trajectory; its group is numbered, whatever its name.
+
+        Raises:
+            DataError: the trajectory couldn't be read back (too short, not finite, ...).
+            OSError: the disk is full.
+        """
+        group = f"{self._written:05d}"
+        where = f"{self.path}: trajectory {group}"
+        check_shape(Shape(group, *trajectory.positions.shape), where)
+        check_finite(trajectory, 0, where)
+        types = particle_types(trajectory.particle_type, trajectory.positions.shape[1], where)
+        check_type_range(types, where)
+        members = self._file.create_group(group)
+        members.create_dataset("position", data=trajectory.positions, dtype="<f4")
+        members.create_dataset("particle_type", data=types)
+        if trajectory.material_property is not None:
+            members.create_dataset("material_property", data=trajectory.material_property)
+        self._written += 1
+
+    def __enter__(self) -> StoreWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None:
+                self._file.close()
+                publish(self._partial, self.path)
+                return
+            # On a full disk closing fails as well; the file is thrown away in any case.
+            with suppress(OSError, RuntimeError):
+                self._file.close()
+        finally:
+            self._partial.unlink(missing_ok=True)
 
 
-def _clean(positions: npt.NDArray[Any], entry: _Entry) -> npt.NDArray[np.float32]:
-    """Native float32, without padding rows."""
-    if entry.real is not None:
-        positions = positions[:, entry.real]
-    return positions.astype(np.float32, copy=False)
+def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
+    """Writes trajectories to `path`, whole or not at all, holding one of them at a time.
+
+    Raises:
+        DataError: a trajectory that couldn't be read back.
+        OSError: the disk is full.
+    """
+    with StoreWriter(path) as writer:
+        for trajectory in trajectories:
+            writer.append(trajectory)
+
+
+def partial_path(path: Path) -> Path:
+    """Where a file is while it is being written."""
+    return path.with_name(f"{path.name}.partial")
+
+
+def read_origin(path: Path) -> str | None:
+    """What made the file, if it says so; None for foreign and unreadable files."""
+    try:
+        with h5py.File(path, "r") as file:
+            origin = file.attrs.get(_ORIGIN)
+    except OSError:
+        return None
+    return origin if isinstance(origin, str) else None

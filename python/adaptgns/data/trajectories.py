@@ -10,8 +10,8 @@ import numpy as np
 
 from adaptgns.data.errors import DataError
 from adaptgns.data.npz import NpzSource
-from adaptgns.data.store import StoreSource
-from adaptgns.data.trajectory import INPUT_FRAMES, MIN_FRAMES, Shape, Source, Trajectory
+from adaptgns.data.store_source import StoreSource
+from adaptgns.data.trajectory import Source, Trajectory, check_finite, check_shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -47,26 +47,15 @@ class Trajectories:
         )
         if not source.shapes:
             raise DataError(f"{self.path}: holds no trajectory")
-        for shape in source.shapes:
-            self._check_shape(shape, source.shapes[0].dim)
         self.dim = source.shapes[0].dim
-
-    def _check_shape(self, shape: Shape, dim: int) -> None:
-        where = f"{self.path}: trajectory {shape.name}"
-        if shape.frames < MIN_FRAMES:
-            raise DataError(
-                f"{where}: {shape.frames} frames; at least {MIN_FRAMES} are needed "
-                f"({INPUT_FRAMES} as input and 1 as target)"
-            )
-        if shape.particles < 1:
-            raise DataError(f"{where}: no particles")
-        if shape.dim not in {2, 3}:
-            raise DataError(f"{where}: positions have {shape.dim} dimensions; 2 or 3 are accepted")
-        if shape.dim != dim:
-            raise DataError(
-                f"{where}: positions have {shape.dim} dimensions, those of trajectory "
-                f"{self.names[0]} have {dim}"
-            )
+        for shape in source.shapes:
+            where = f"{self.path}: trajectory {shape.name}"
+            check_shape(shape, where)
+            if shape.dim != self.dim:
+                raise DataError(
+                    f"{where}: positions have {shape.dim} dimensions, those of trajectory "
+                    f"{self.names[0]} have {self.dim}"
+                )
 
     def __len__(self) -> int:
         return len(self.names)
@@ -92,7 +81,7 @@ class Trajectories:
                 f"{self.lengths[index]}"
             )
         trajectory = self._source.read(index, start, stop)
-        self._check_finite(trajectory, start)
+        check_finite(trajectory, start, f"{self.path}: trajectory {trajectory.name}")
         return trajectory
 
     @property
@@ -104,23 +93,6 @@ class Trajectories:
         if not -len(self) <= index < len(self):
             raise IndexError(f"trajectory {index} of {len(self)} in {self.path}")
         return index % len(self)
-
-    def _check_finite(self, trajectory: Trajectory, start: int) -> None:
-        finite = np.isfinite(trajectory.positions)
-        if not finite.all():
-            frame, particle = np.argwhere(~finite)[0, :2]
-            raise DataError(
-                f"{self.path}: trajectory {trajectory.name}: frame {start + frame}: particle "
-                f"{particle} is at {trajectory.positions[frame, particle].tolist()}; positions "
-                "must be finite"
-            )
-        material = trajectory.material_property
-        if material is not None and not np.isfinite(material).all():
-            particle = np.argwhere(~np.isfinite(material))[0, 0]
-            raise DataError(
-                f"{self.path}: trajectory {trajectory.name}: material_property of particle "
-                f"{particle} is {material[particle].tolist()}; it must be finite"
-            )
 
 
 def find_split(folder: Path, split: str) -> Path | None:

@@ -63,6 +63,37 @@ class Source(Protocol):
         """Columns of `material_property`; 0 where there are none."""
 
 
+def check_shape(shape: Shape, where: str) -> None:
+    """Raises `DataError` for a trajectory that no model could use."""
+    if shape.frames < MIN_FRAMES:
+        raise DataError(
+            f"{where}: {shape.frames} frames; at least {MIN_FRAMES} are needed "
+            f"({INPUT_FRAMES} as input and 1 as target)"
+        )
+    if shape.particles < 1:
+        raise DataError(f"{where}: no particles")
+    if shape.dim not in {2, 3}:
+        raise DataError(f"{where}: positions have {shape.dim} dimensions; 2 or 3 are accepted")
+
+
+def check_finite(trajectory: Trajectory, first_frame: int, where: str) -> None:
+    """Raises `DataError` for NaN and infinity, naming the first frame and particle."""
+    finite = np.isfinite(trajectory.positions)
+    if not finite.all():
+        frame, particle = np.argwhere(~finite)[0, :2]
+        raise DataError(
+            f"{where}: frame {first_frame + frame}: particle {particle} is at "
+            f"{trajectory.positions[frame, particle].tolist()}; positions must be finite"
+        )
+    material = trajectory.material_property
+    if material is not None and not np.isfinite(material).all():
+        particle = np.argwhere(~np.isfinite(material))[0, 0]
+        raise DataError(
+            f"{where}: material_property of particle {particle} is "
+            f"{material[particle].tolist()}; it must be finite"
+        )
+
+
 def particle_types(raw: Any, particles: int, where: str) -> npt.NDArray[np.int64]:
     """Types as int64 `[particles]`, from an array of that length or from one number for all."""
     types = np.asarray(raw)
