@@ -1,0 +1,213 @@
+//! Constitutive laws. All quantities are per unit of rest density, so that moduli are
+//! squared speeds [m²/s²] and the rest density is 1.
+
+use super::linalg::{self, Matrix};
+
+/// What a particle is made of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Material {
+    /// A weakly compressible liquid.
+    Water(Water),
+    /// A dry granular medium.
+    Sand(Sand),
+}
+
+/// How a material meets a wall. Both let go of a wall without resistance.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Contact {
+    /// The wall takes the velocity into it, nothing else.
+    Slip,
+    /// The wall also slows the sliding by this coefficient times the velocity taken
+    /// (Coulomb friction).
+    Friction(f64),
+}
+
+/// Tait's equation of state p = c²/γ ((ρ/ρ₀)^γ − 1), with little tension and a Newtonian
+/// viscosity.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Water {
+    /// Speed of sound at rest density \[m/s\].
+    pub sound_speed: f64,
+    /// Exponent γ.
+    pub exponent: f64,
+    /// Kinematic viscosity \[m²/s\].
+    pub viscosity: f64,
+    /// Largest expansion, as a logarithm of volume, up to which water holds together.
+    pub cohesion: f64,
+    /// x
+    pub torn: f64,
+}
+
+/// Drucker–Prager plasticity on Hencky strains (Klár et al. 2016, section 6).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sand {
+    /// Lamé's first parameter \[m²/s²\].
+    pub lambda: f64,
+    /// Shear modulus \[m²/s²\].
+    pub mu: f64,
+    /// Angle of internal friction \[rad\].
+    pub friction_angle: f64,
+    /// Friction coefficient at the walls.
+    pub wall_friction: f64,
+}
+
+/// What a material remembers of a particle's past.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct History<const D: usize> {
+    /// Sand: elastic left Cauchy–Green tensor b = F Fᵀ. Its eigenvectors are the left
+    /// singular vectors of F and its eigenvalues the squared singular values, which is
+    /// all that isotropic return mapping needs.
+    left_cauchy_green: Matrix<D>,
+    /// Logarithm of the volume over the volume at rest. Sand: of the part gained while
+    /// falling apart, which is given back before the material bears load again (the
+    /// volume correction of Klár et al.).
+    log_volume: f64,
+}
+
+impl<const D: usize> History<D> {
+    pub(crate) fn at_rest() -> Self {
+        Self {
+            left_cauchy_green: linalg::identity(),
+            log_volume: 0.0,
+        }
+    }
+}
+
+impl Material {
+    /// Speed of sound \[m/s\] in a particle.
+    pub(crate) fn sound_speed<const D: usize>(&self, history: &History<D>) -> f64 {
+        match self {
+            Self::Water(water) => {
+                let compression = (-history.log_volume).max(0.0);
+                water.sound_speed * (0.5 * (water.exponent - 1.0) * compression).exp()
+            }
+            Self::Sand(sand) => (sand.lambda + 2.0 * sand.mu).sqrt(),
+        }
+    }
+
+    pub(crate) fn contact(&self) -> Contact {
+        match self {
+            Self::Water(_) => Contact::Slip,
+            Self::Sand(sand) => Contact::Friction(sand.wall_friction),
+        }
+    }
+
+    /// Kirchhoff stress per unit of rest density \[m²/s²\], after the velocity gradient
+    /// has acted on the particle for the time `dt`.
+    pub(crate) fn stress<const D: usize>(
+        &self,
+        history: &mut History<D>,
+        velocity_gradient: &Matrix<D>,
+        dt: f64,
+    ) -> Matrix<D> {
+        match self {
+            Self::Water(water) => water.stress(history, velocity_gradient, dt),
+            Self::Sand(sand) => sand.stress(history, velocity_gradient, dt),
+        }
+    }
+
+    /// Stored elastic energy per mass \[m²/s²\].
+    pub(crate) fn energy<const D: usize>(&self, history: &History<D>) -> f64 {
+        match self {
+            Self::Water(water) => water.energy(history.log_volume),
+            Self::Sand(sand) => sand.energy(history),
+        }
+    }
+}
+
+impl Water {
+    fn stress<const D: usize>(
+        &self,
+        history: &mut History<D>,
+        velocity_gradient: &Matrix<D>,
+        dt: f64,
+    ) -> Matrix<D> {
+        let divergence = linalg::trace(velocity_gradient);
+        history.log_volume = (history.log_volume + dt * divergence).min(self.torn);
+        let log_volume = history.log_volume.min(self.cohesion);
+        let modulus = self.sound_speed.powi(2) / self.exponent;
+        let pressure = modulus * ((-self.exponent * log_volume).exp() - 1.0);
+        // Kirchhoff stress is Cauchy stress times the volume ratio.
+        let volume = history.log_volume.exp();
+        let mut stress = linalg::zero();
+        for i in 0..D {
+            for j in 0..D {
+                stress[i][j] =
+                    volume * self.viscosity * (velocity_gradient[i][j] + velocity_gradient[j][i]);
+            }
+            stress[i][i] -= volume * (2.0 / D as f64 * self.viscosity * divergence + pressure);
+        }
+        stress
+    }
+
+    /// −∫ p dV from rest.
+    fn energy(&self, log_volume: f64) -> f64 {
+        let held = log_volume.min(self.cohesion);
+        let modulus = self.sound_speed.powi(2) / self.exponent;
+        let compression = ((1.0 - self.exponent) * held).exp() - 1.0;
+        let tension = 1.0 - (-self.exponent * self.cohesion).exp();
+        modulus
+            * (compression / (self.exponent - 1.0) + held.exp() - 1.0
+                + tension * (log_volume.exp() - held.exp()))
+    }
+}
+
+impl Sand {
+    fn stress<const D: usize>(
+        &self,
+        history: &mut History<D>,
+        velocity_gradient: &Matrix<D>,
+        dt: f64,
+    ) -> Matrix<D> {
+        let mut step = linalg::identity();
+        for i in 0..D {
+            for j in 0..D {
+                step[i][j] += dt * velocity_gradient[i][j];
+            }
+        }
+        let trial = linalg::congruence(&step, &history.left_cauchy_green);
+        let (squares, axes) = linalg::symmetric_eigen(&trial);
+        let trial: [f64; D] = squares.map(|square| 0.5 * square.max(f64::MIN_POSITIVE).ln());
+        let strain = self.project(trial, &mut history.log_volume);
+        history.left_cauchy_green =
+            linalg::congruence(&axes, &linalg::diagonal(&strain.map(|e| (2.0 * e).exp())));
+        let volumetric: f64 = self.lambda * strain.iter().sum::<f64>();
+        linalg::congruence(
+            &axes,
+            &linalg::diagonal(&strain.map(|e| volumetric + 2.0 * self.mu * e)),
+        )
+    }
+
+    /// Return mapping of principal Hencky strains to the Drucker–Prager cone: what
+    /// expands falls apart, what is sheared beyond friction slides without changing
+    /// its volume.
+    fn project<const D: usize>(&self, trial: [f64; D], log_volume: &mut f64) -> [f64; D] {
+        let dimension = D as f64;
+        let expansion = trial.iter().sum::<f64>() + *log_volume;
+        if expansion >= 0.0 {
+            *log_volume = expansion;
+            return [0.0; D];
+        }
+        let mean = (expansion - *log_volume) / dimension;
+        *log_volume = 0.0;
+        let deviator = trial.map(|e| e - mean);
+        let shear = linalg::dot(&deviator, &deviator).sqrt();
+        let sine = self.friction_angle.sin();
+        let slope = (2.0_f64 / 3.0).sqrt() * 2.0 * sine / (3.0 - sine);
+        let bearable =
+            -slope * expansion * (dimension * self.lambda + 2.0 * self.mu) / (2.0 * self.mu);
+        let scale = if shear > bearable {
+            bearable / shear
+        } else {
+            1.0
+        };
+        deviator.map(|e| expansion / dimension + scale * e)
+    }
+
+    fn energy<const D: usize>(&self, history: &History<D>) -> f64 {
+        let (squares, _) = linalg::symmetric_eigen(&history.left_cauchy_green);
+        let strain = squares.map(|square| 0.5 * square.ln());
+        let volumetric: f64 = strain.iter().sum();
+        self.mu * linalg::dot(&strain, &strain) + 0.5 * self.lambda * volumetric.powi(2)
+    }
+}

@@ -1,0 +1,284 @@
+//! Random scenes: blocks of one material thrown into a box.
+
+use super::grid::Walls;
+use super::material::{Material, Sand, Water};
+use super::rng::Rng;
+use super::solver::Simulation;
+use crate::Error;
+
+/// The box of every scene.
+pub const WALLS: Walls = Walls {
+    low: 0.1,
+    high: 0.9,
+};
+/// Fewest particles a scene can be asked for.
+const MIN_PARTICLES: usize = 16;
+/// Largest part of the box's volume that a scene can be asked to fill.
+const MAX_FILL: f64 = 0.5;
+/// Tries at placing blocks apart before settling for a single one.
+const MAX_TRIES: usize = 100;
+
+/// A family of random scenes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scene {
+    /// One or two drops of water.
+    WaterDrop,
+    /// One to three piles of sand.
+    Sand,
+}
+
+/// What is drawn for a scene, at the resolution of its published counterpart.
+struct Recipe {
+    material: Material,
+    particle_type: i64,
+    /// Distance of particles \[m\], in 2D and 3D.
+    spacing: [f64; 2],
+    /// Distance of grid nodes over distance of particles.
+    coarseness: f64,
+    /// Largest offset from the lattice, in spacings.
+    jitter: f64,
+    /// Range of the number of particles, in 2D and 3D.
+    particles: [(usize, usize); 2],
+    /// Probability of one block, two blocks, ...
+    blocks: &'static [f64],
+    /// Largest side over smallest.
+    aspect: f64,
+    /// Largest velocity along each axis \[m/s\].
+    speed: f64,
+}
+
+struct Block<const D: usize> {
+    low: [f64; D],
+    size: [f64; D],
+    velocity: [f64; D],
+    particles: usize,
+}
+
+impl Scene {
+    /// Every scene, with its name.
+    pub const ALL: [(&'static str, Self); 2] =
+        [("waterdrop", Self::WaterDrop), ("sand", Self::Sand)];
+
+    /// The scene of this name.
+    ///
+    /// # Errors
+    ///
+    /// Lists the names there are if there is none.
+    pub fn from_name(name: &str) -> Result<Self, Error> {
+        Self::ALL
+            .iter()
+            .find(|(known, _)| *known == name)
+            .map(|&(_, scene)| scene)
+            .ok_or_else(|| {
+                let names: Vec<String> = Self::ALL
+                    .iter()
+                    .map(|(known, _)| format!("'{known}'"))
+                    .collect();
+                Error::invalid(
+                    "scene",
+                    format!("got '{name}', accepted are {}", names.join(", ")),
+                )
+            })
+    }
+
+    /// Particle type in the convention of GNS.
+    pub fn particle_type(self) -> i64 {
+        self.recipe().particle_type
+    }
+
+    /// Draws the scene of a seed, with a number of particles in `particles` (both ends
+    /// included) or as many as its published counterpart has.
+    ///
+    /// # Errors
+    ///
+    /// If `particles` is empty, too small for a block or too large for the box.
+    pub fn draw<const D: usize>(
+        self,
+        seed: u64,
+        particles: Option<(usize, usize)>,
+    ) -> Result<Simulation<D>, Error> {
+        let recipe = self.recipe();
+        let spacing = recipe.spacing[D - 2];
+        let (low, high) = particles.unwrap_or(recipe.particles[D - 2]);
+        let most = (MAX_FILL * ((WALLS.high - WALLS.low) / spacing).powi(D as i32)) as usize;
+        if !(MIN_PARTICLES <= low && low <= high && high <= most) {
+            return Err(Error::invalid(
+                "particles",
+                format!(
+                    "got ({low}, {high}), accepted is {MIN_PARTICLES} <= low <= high <= {most}"
+                ),
+            ));
+        }
+        let mut rng = Rng::new(seed, self as u64 * 2 + D as u64);
+        let count = rng.integer(low, high);
+        let blocks = draw_blocks::<D>(&mut rng, &recipe, count);
+        let particles: Vec<_> = blocks
+            .iter()
+            .flat_map(|block| fill(&mut rng, block, spacing, recipe.jitter))
+            .collect();
+        Ok(Simulation::new(
+            recipe.material,
+            WALLS,
+            spacing,
+            recipe.coarseness * spacing,
+            particles,
+        ))
+    }
+
+    fn recipe(self) -> Recipe {
+        let knob = |name: &str, default: f64| -> f64 {
+            std::env::var(name)
+                .ok()
+                .map_or(default, |v| v.parse().unwrap())
+        };
+        match self {
+            Self::WaterDrop => Recipe {
+                material: Material::Water(Water {
+                    sound_speed: knob("C", 14.0),
+                    exponent: 7.0,
+                    viscosity: knob("VISC", 0.003),
+                    cohesion: knob("TENS", 0.01),
+                    torn: knob("TORN", 0.5),
+                }),
+                particle_type: 5,
+                spacing: [knob("SP", 0.0102), 0.025],
+                coarseness: knob("COARSE", 1.9),
+                jitter: knob("JIT", 0.45),
+                particles: [(220, 914), (1000, 6000)],
+                blocks: &[0.8, 0.2],
+                aspect: 1.6,
+                speed: knob("SPEED", 0.5),
+            },
+            Self::Sand => Recipe {
+                material: Material::Sand(Sand {
+                    lambda: knob("LAM", 350.0),
+                    mu: knob("MU", 230.0),
+                    friction_angle: knob("PHI", 40.0_f64).to_radians(),
+                    wall_friction: knob("WF", 0.4),
+                }),
+                particle_type: 6,
+                spacing: [knob("SP", 0.0098), 0.025],
+                coarseness: knob("COARSE", 2.0),
+                jitter: knob("JIT", 0.45),
+                particles: [(400, 2140), (2000, 8000)],
+                blocks: &[0.4, 0.3, 0.3],
+                aspect: 2.0,
+                speed: knob("SPEED", 2.0),
+            },
+        }
+    }
+}
+
+/// Blocks that lie inside the box and apart from each other.
+fn draw_blocks<const D: usize>(rng: &mut Rng, recipe: &Recipe, count: usize) -> Vec<Block<D>> {
+    let spacing = recipe.spacing[D - 2];
+    let number = draw_number(rng, recipe.blocks).min(count / MIN_PARTICLES);
+    for _ in 0..MAX_TRIES {
+        let mut blocks = Vec::with_capacity(number);
+        let mut left = count;
+        for index in 0..number {
+            let share = left as f64 / (number - index) as f64;
+            let particles = if index + 1 == number {
+                left
+            } else {
+                (share * rng.uniform(0.7, 1.3)) as usize
+            };
+            left -= particles;
+            blocks.push(draw_block(rng, recipe, particles));
+        }
+        let inside = |block: &Block<D>| {
+            (0..D).all(|axis| block.low[axis] + block.size[axis] <= WALLS.high - 0.5 * spacing)
+        };
+        let apart = |a: &Block<D>, b: &Block<D>| {
+            (0..D).any(|axis| {
+                a.low[axis] + a.size[axis] + spacing <= b.low[axis]
+                    || b.low[axis] + b.size[axis] + spacing <= a.low[axis]
+            })
+        };
+        if blocks.iter().all(inside)
+            && (0..number).all(|a| (0..a).all(|b| apart(&blocks[a], &blocks[b])))
+        {
+            return blocks;
+        }
+    }
+    // A cube of half the box's volume fits for every count that is accepted.
+    let mut block = draw_block(
+        rng,
+        &Recipe {
+            aspect: 1.0,
+            ..*recipe
+        },
+        count,
+    );
+    block.particles = count;
+    vec![block]
+}
+
+/// Number of blocks, of which `probabilities[k]` is that of k + 1.
+fn draw_number(rng: &mut Rng, probabilities: &[f64]) -> usize {
+    let mut level = rng.uniform(0.0, 1.0);
+    for (index, probability) in probabilities.iter().enumerate() {
+        level -= probability;
+        if level < 0.0 {
+            return index + 1;
+        }
+    }
+    probabilities.len()
+}
+
+/// A block of `particles` at rest density, inside the box where it fits.
+fn draw_block<const D: usize>(rng: &mut Rng, recipe: &Recipe, particles: usize) -> Block<D> {
+    let spacing = recipe.spacing[D - 2];
+    let stretch = 0.5 * recipe.aspect.ln();
+    let stretch: [f64; D] = std::array::from_fn(|_| rng.uniform(-stretch, stretch));
+    let mean = stretch.iter().sum::<f64>() / D as f64;
+    let side = spacing * (particles as f64).powf(1.0 / D as f64);
+    // Whole rows across, and along the first axis whatever length gives the volume.
+    let mut size = stretch.map(|s| (side * (s - mean).exp() / spacing).round().max(1.0) * spacing);
+    let rows: f64 = size[1..].iter().map(|length| length / spacing).product();
+    size[0] = particles as f64 * spacing / rows;
+    let low = size.map(|length| {
+        let room = (WALLS.high - WALLS.low - spacing - length).max(0.0);
+        WALLS.low + 0.5 * spacing + rng.uniform(0.0, room)
+    });
+    let velocity = std::array::from_fn(|_| rng.uniform(-recipe.speed, recipe.speed));
+    Block {
+        low,
+        size,
+        velocity,
+        particles,
+    }
+}
+
+/// Positions and velocities of a block's particles, on a lattice of rows along the first
+/// axis, each moved at random by up to `jitter` spacings.
+fn fill<const D: usize>(
+    rng: &mut Rng,
+    block: &Block<D>,
+    spacing: f64,
+    jitter: f64,
+) -> Vec<([f64; D], [f64; D])> {
+    let across: [usize; D] = block.size.map(|length| (length / spacing).round() as usize);
+    let rows: usize = across[1..].iter().product();
+    let mut particles = Vec::with_capacity(block.particles);
+    for row in 0..rows {
+        // The rows share the particles evenly; where this leaves a remainder, some rows
+        // are denser by one particle.
+        let along = (row + 1) * block.particles / rows - row * block.particles / rows;
+        for index in 0..along {
+            let mut remainder = row;
+            let position = std::array::from_fn(|axis| {
+                let lattice = if axis == 0 {
+                    block.size[0] / along as f64 * (index as f64 + 0.5)
+                } else {
+                    let step = remainder % across[axis];
+                    remainder /= across[axis];
+                    spacing * (step as f64 + 0.5)
+                };
+                block.low[axis] + lattice + spacing * rng.uniform(-jitter, jitter)
+            });
+            particles.push((position, block.velocity));
+        }
+    }
+    particles
+}

@@ -1,0 +1,261 @@
+//! The moving least squares material point method.
+
+use super::grid::{Grid, Stencil, Walls};
+use super::linalg::{self, Matrix};
+use super::material::{Contact, History, Material};
+
+/// Standard gravity, along the second axis \[m/s²\].
+pub const GRAVITY: f64 = 9.81;
+/// Time between two frames \[s\].
+pub const FRAME_TIME: f64 = 0.0025;
+/// Part of a cell that sound and matter together may cross in one step.
+const COURANT: f64 = 0.4;
+/// Distance that particles keep from the walls, in grid spacings: small against their
+/// own distance, large against the rounding of a position to single precision.
+const WALL_MARGIN: f64 = 0.05;
+
+#[derive(Clone)]
+struct Particle<const D: usize> {
+    position: [f64; D],
+    /// Velocity half a step before the time of the position.
+    velocity: [f64; D],
+    velocity_gradient: Matrix<D>,
+    history: History<D>,
+}
+
+/// Particles of one material in a box, after Hu et al., "A moving least squares material
+/// point method" (2018), with affine transfers (Jiang et al. 2015).
+///
+/// A step scatters mass, momentum and stress to the grid, solves there for velocities
+/// with gravity and walls, and gathers them back. Velocities live half a step before the
+/// positions, so that free flight is an exact parabola whatever the step.
+pub struct Simulation<const D: usize> {
+    particles: Vec<Particle<D>>,
+    material: Material,
+    grid: Grid<D>,
+    walls: Walls,
+    particle_mass: f64,
+    /// Length of the last step \[s\].
+    step: f64,
+}
+
+impl<const D: usize> Simulation<D> {
+    /// Particles of equal mass, at rest density when `particle_spacing` apart on a
+    /// square lattice, on a grid of about `grid_spacing`. Positions outside the walls
+    /// are moved to them.
+    pub fn new(
+        material: Material,
+        walls: Walls,
+        particle_spacing: f64,
+        grid_spacing: f64,
+        particles: impl IntoIterator<Item = ([f64; D], [f64; D])>,
+    ) -> Self {
+        const {
+            assert!(D == 2 || D == 3);
+        }
+        let particles = particles
+            .into_iter()
+            .map(|(position, velocity)| Particle {
+                position,
+                velocity,
+                velocity_gradient: linalg::zero(),
+                history: History::at_rest(),
+            })
+            .collect();
+        let mut simulation = Self {
+            particles,
+            material,
+            grid: Grid::new(walls, grid_spacing),
+            walls,
+            particle_mass: particle_spacing.powi(D as i32),
+            step: 0.0,
+        };
+        simulation.keep_inside();
+        simulation
+    }
+
+    /// Advances by [`FRAME_TIME`].
+    pub fn advance_frame(&mut self) {
+        let (mut fastest, mut sound) = (0.0_f64, 0.0_f64);
+        for particle in &self.particles {
+            fastest = fastest.max(linalg::dot(&particle.velocity, &particle.velocity));
+            sound = sound.max(self.material.sound_speed(&particle.history));
+        }
+        let speed = fastest.sqrt() + sound;
+        let steps = (FRAME_TIME * speed / (COURANT * self.grid.spacing)).ceil();
+        self.change_step(FRAME_TIME / steps);
+        for _ in 0..steps as usize {
+            self.advance_step();
+        }
+    }
+
+    /// Positions in the order of construction \[m\].
+    pub fn positions(&self) -> impl ExactSizeIterator<Item = &[f64; D]> {
+        self.particles.iter().map(|particle| &particle.position)
+    }
+
+    /// Velocities at the time of the positions \[m/s\].
+    pub fn velocities(&self) -> impl ExactSizeIterator<Item = [f64; D]> {
+        self.particles.iter().map(|particle| {
+            let mut velocity = particle.velocity;
+            velocity[1] -= 0.5 * GRAVITY * self.step;
+            velocity
+        })
+    }
+
+    /// Mass of all particles, with rest density 1.
+    pub fn mass(&self) -> f64 {
+        self.particle_mass * self.particles.len() as f64
+    }
+
+    /// Sum of mass times velocity.
+    pub fn momentum(&self) -> [f64; D] {
+        self.velocities().fold([0.0; D], |sum, velocity| {
+            std::array::from_fn(|axis| sum[axis] + self.particle_mass * velocity[axis])
+        })
+    }
+
+    /// Kinetic, potential and stored energy.
+    pub fn energy(&self) -> f64 {
+        // Inertia of a quadratic spline about its centre (Jiang et al. 2015).
+        let inertia = 0.25 * self.grid.spacing.powi(2);
+        self.particles
+            .iter()
+            .zip(self.velocities())
+            .map(|(particle, velocity)| {
+                let spin: f64 = particle
+                    .velocity_gradient
+                    .iter()
+                    .map(|row| linalg::dot(row, row))
+                    .sum();
+                0.5 * linalg::dot(&velocity, &velocity)
+                    + 0.5 * inertia * spin
+                    + GRAVITY * (particle.position[1] - self.walls.low)
+                    + self.material.energy(&particle.history)
+            })
+            .sum::<f64>()
+            * self.particle_mass
+    }
+
+    /// Velocities are those of half a step before: a new step moves that moment, between
+    /// which gravity acts.
+    fn change_step(&mut self, step: f64) {
+        let kick = -0.5 * GRAVITY * (self.step - step);
+        for particle in &mut self.particles {
+            particle.velocity[1] += kick;
+        }
+        self.step = step;
+    }
+
+    fn advance_step(&mut self) {
+        self.grid
+            .cover(self.particles.iter().map(|particle| &particle.position));
+        self.scatter();
+        self.update_grid();
+        self.gather();
+        self.keep_inside();
+    }
+
+    fn scatter(&mut self) {
+        let mass = self.particle_mass;
+        let stress_scale = -self.step * 4.0 / self.grid.spacing.powi(2);
+        for particle in &mut self.particles {
+            let stress = self.material.stress(
+                &mut particle.history,
+                &particle.velocity_gradient,
+                self.step,
+            );
+            let mut affine = particle.velocity_gradient;
+            for i in 0..D {
+                for j in 0..D {
+                    affine[i][j] += stress_scale * stress[i][j];
+                }
+            }
+            let stencil = self.grid.stencil(&particle.position);
+            for k in 0..Stencil::<D>::LEN {
+                let node = &mut self.grid.nodes[stencil.nodes[k]];
+                let weighted_mass = stencil.weights[k] * mass;
+                node.mass += weighted_mass;
+                for axis in 0..D {
+                    node.velocity[axis] += weighted_mass
+                        * (particle.velocity[axis] + linalg::dot(&affine[axis], &stencil.arms[k]));
+                }
+            }
+        }
+    }
+
+    /// Momentum to velocity, gravity, walls.
+    fn update_grid(&mut self) {
+        let kick = -GRAVITY * self.step;
+        let contact = self.material.contact();
+        let sides: Vec<f64> = (0..self.grid.side())
+            .map(|index| self.grid.wall_side(index))
+            .collect();
+        self.grid.for_each_row(|row, first| {
+            for (along, node) in row.iter_mut().enumerate() {
+                if node.mass == 0.0 {
+                    continue;
+                }
+                for axis in 0..D {
+                    node.velocity[axis] /= node.mass;
+                }
+                node.velocity[1] += kick;
+                for axis in 0..D {
+                    let index = first[axis] + if axis == D - 1 { along } else { 0 };
+                    let into = sides[index] * node.velocity[axis];
+                    if into > 0.0 {
+                        node.velocity[axis] = 0.0;
+                        if let Contact::Friction(coefficient) = contact {
+                            slow(&mut node.velocity, axis, coefficient * into);
+                        }
+                    }
+                }
+            }
+        });
+    }
+
+    fn gather(&mut self) {
+        let gradient_scale = 4.0 / self.grid.spacing.powi(2);
+        for particle in &mut self.particles {
+            let stencil = self.grid.stencil(&particle.position);
+            let mut velocity = [0.0; D];
+            let mut gradient: Matrix<D> = linalg::zero();
+            for k in 0..Stencil::<D>::LEN {
+                let node = &self.grid.nodes[stencil.nodes[k]];
+                for axis in 0..D {
+                    let weighted = stencil.weights[k] * node.velocity[axis];
+                    velocity[axis] += weighted;
+                    for other in 0..D {
+                        gradient[axis][other] += gradient_scale * weighted * stencil.arms[k][other];
+                    }
+                }
+            }
+            particle.velocity = velocity;
+            particle.velocity_gradient = gradient;
+            for axis in 0..D {
+                particle.position[axis] += self.step * velocity[axis];
+            }
+        }
+    }
+
+    fn keep_inside(&mut self) {
+        let margin = WALL_MARGIN * self.grid.spacing;
+        let (low, high) = (self.walls.low + margin, self.walls.high - margin);
+        for particle in &mut self.particles {
+            for x in &mut particle.position {
+                *x = x.clamp(low, high);
+            }
+        }
+    }
+}
+
+/// Takes `amount` off the speed along a wall with the normal `axis`, at most all of it.
+fn slow<const D: usize>(velocity: &mut [f64; D], axis: usize, amount: f64) {
+    let sliding = linalg::dot(velocity, velocity) - velocity[axis].powi(2);
+    let kept = (1.0 - amount / sliding.max(f64::MIN_POSITIVE).sqrt()).max(0.0);
+    for (other, component) in velocity.iter_mut().enumerate() {
+        if other != axis {
+            *component *= kept;
+        }
+    }
+}
