@@ -1,0 +1,116 @@
+"""Checkpoints: one safetensors file each, written whole or not at all.
+
+The file's header holds the run's configuration and the data's metadata as JSON, enough to rebuild
+the simulator with nothing else. Tensors: ``model.*``; ``average.*``, the moving average of the
+weights where the run keeps one; ``optimizer.*`` in the files that training goes on from.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from adaptgns.atomic import written_whole
+from adaptgns.config import TrainConfig, from_json, to_json
+from adaptgns.data.metadata import Metadata
+from adaptgns.simulator import Simulator
+
+BEST = "best.safetensors"
+LAST = "last.safetensors"
+FORMAT = "adaptgns-checkpoint-1"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is missing, damaged or of another kind."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint file holds."""
+
+    config: TrainConfig
+    metadata: Metadata
+    step: int
+    """Optimizer steps taken."""
+    best_score: float
+    """Lowest validation score so far; inf before the first."""
+    tensors: dict[str, Tensor]
+
+    def group(self, name: str) -> dict[str, Tensor]:
+        """The tensors whose names start with ``name.``, without that prefix."""
+        prefix = name + "."
+        return {k.removeprefix(prefix): v for k, v in self.tensors.items() if k.startswith(prefix)}
+
+    def simulator(self) -> Simulator:
+        """The simulator with the weights to be used: their average where there is one."""
+        simulator = build_simulator(self.config, self.metadata)
+        simulator.load_state_dict(self.group("average") or self.group("model"))
+        return simulator.eval()
+
+
+def build_simulator(config: TrainConfig, metadata: Metadata) -> Simulator:
+    """An untrained simulator for ``config``, on data described by ``metadata``."""
+    return Simulator(config.model, metadata, noise=config.noise, variance=config.loss != "mse")
+
+
+def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """``tensors`` named as a group of a checkpoint."""
+    return {f"{prefix}.{name}": tensor.detach().contiguous() for name, tensor in tensors.items()}
+
+
+def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Write ``checkpoint`` to ``path``, replacing what is there only when it is safely on disk."""
+    header = {
+        "format": FORMAT,
+        "config": json.dumps(to_json(checkpoint.config)),
+        "metadata": json.dumps(checkpoint.metadata.to_json()),
+        "step": str(checkpoint.step),
+        "best_score": repr(checkpoint.best_score),
+    }
+    with written_whole(path) as partial:
+        partial.write_bytes(save(checkpoint.tensors, header))
+
+
+def read_checkpoint(path: Path, *, device: str = "cpu") -> Checkpoint:
+    """The checkpoint in the file ``path``, or in the run folder ``path``: its best one, else its
+    last.
+
+    Raises :class:`CheckpointError` where there is none or it is not whole.
+    """
+    file = checkpoint_file(path)
+    try:
+        with safe_open(file, framework="pt", device=device) as archive:
+            header = archive.metadata() or {}
+            tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"checkpoint {file}: cannot be read ({error})") from error
+    if header.get("format") != FORMAT:
+        raise CheckpointError(
+            f"checkpoint {file}: its format is {header.get('format')!r}; accepted is {FORMAT!r}"
+        )
+    return Checkpoint(
+        config=from_json(TrainConfig, json.loads(header["config"]), source=str(file)),
+        metadata=Metadata.from_json(json.loads(header["metadata"])),
+        step=int(header["step"]),
+        best_score=float(header["best_score"]),
+        tensors=tensors,
+    )
+
+
+def checkpoint_file(path: Path) -> Path:
+    """The checkpoint file that ``path``, a file or a run folder, stands for."""
+    candidates = [path] if path.is_file() else [path / BEST, path / LAST]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise CheckpointError(
+        f"checkpoint {path}: not found; accepted are a .safetensors file and a run folder "
+        f"that holds {BEST} or {LAST}"
+    )

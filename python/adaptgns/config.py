@@ -1,0 +1,183 @@
+"""Every option of a run, as frozen dataclasses that are stored whole in each checkpoint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import cattrs
+import torch
+from cattrs.preconf.json import make_converter
+
+HISTORY = 6
+"""Positions the network looks at: the current one and the five before it."""
+
+PARTICLE_TYPES = 9
+TYPE_EMBEDDING = 16
+
+Loss = Literal["nll", "mse"]
+Preset = Literal["smoke", "laptop", "paper"]
+PolicyName = Literal["fixed", "adaptive", "two-pass", "random", "knn"]
+Device = Literal["auto", "cpu", "cuda"]
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The network."""
+
+    latent: int = 128
+    """Width of the latents and of the hidden layers."""
+    hidden_layers: int = 2
+    """Hidden layers of each MLP."""
+    steps: int = 10
+    """Message-passing steps."""
+    edges: bool = True
+    """False: the per-particle MLP baseline, the same network without any edges."""
+    self_edges: bool = True
+    """Connect every particle with itself, too."""
+    radius: float | None = None
+    """Connectivity radius (length units of the data); None: the data set's own."""
+
+
+@dataclass(frozen=True)
+class AdaptiveConfig:
+    """The adaptive graph rule."""
+
+    tau: float = 70.0
+    """Percentile of sigma above which a particle sees farther."""
+    factor: float = 1.267
+    """How many times farther."""
+
+
+@dataclass(frozen=True)
+class RolloutConfig:
+    """Rollouts of a trained model over a split."""
+
+    checkpoint: Path
+    """Run folder or .safetensors file."""
+    out: Path
+    """HDF5 file to write."""
+    data: str | None = None
+    """Folder of a data set or name of an embedded one; None: the one the model was trained on."""
+    split: Literal["train", "valid", "test"] = "test"
+    policy: PolicyName = "fixed"
+    """Which graph each step has; fixed radius, adaptive (sigma of the step before),
+    two-pass (sigma of this step), random (the same share of particles), knn."""
+    adaptive: AdaptiveConfig = field(default_factory=AdaptiveConfig)
+    k: int = 6
+    """Neighbours of the policy knn."""
+    radius: float | None = None
+    """Radius of the graph alone (length units of the data); features stay divided by the radius
+    of training. None: that one."""
+    steps: int | None = None
+    """Frames to predict; None: to each trajectory's end."""
+    trajectories: int | None = None
+    """Trajectories to roll out, from the first; None: all."""
+    one_step_every: int = 10
+    """Frames between the true states at which the error of a single step is measured."""
+    seed: int = 0
+    """Seed of the policy random."""
+    device: Device = "auto"
+    """auto: a GPU where there is one."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run, from the data to the table of results."""
+
+    data: str = "waterdrop"
+    """Folder of a data set, or the name of an embedded one: waterdrop or sand."""
+    out: Path | None = None
+    """Run folder; None: runs/<data>-<preset>-<model>-<loss>-<seed>."""
+    preset: Preset = "laptop"
+    """Which set of defaults all other options start from."""
+    resume: Path | None = None
+    """Go on with the run in this folder, with the configuration saved there."""
+    model: ModelConfig = field(default_factory=ModelConfig)
+    adaptive: AdaptiveConfig = field(default_factory=AdaptiveConfig)
+    loss: Loss = "nll"
+    """nll trains a variance beside the acceleration; mse the acceleration alone."""
+    graph: Literal["base", "adaptive"] = "base"
+    """Graph seen in training; adaptive has the one-step lag of the rollout."""
+    steps: int = 20_000
+    """Optimizer steps."""
+    batch: int = 2
+    """Samples (windows of one trajectory) per step."""
+    lr: float = 1e-4
+    """Learning rate at its highest."""
+    lr_final: float = 1e-6
+    """Learning rate that the schedule ends at (cosine) or falls to (exponential)."""
+    schedule: Literal["exponential", "cosine"] = "exponential"
+    """exponential: a factor 0.1 per 5,000,000 steps; cosine: to lr_final at the last step."""
+    warmup: int = 0
+    """Steps of linear increase of the learning rate from zero."""
+    clip: float | None = None
+    """Largest gradient norm; None: unlimited."""
+    average: float = 0.0
+    """Decay per step of the weights' exponential moving average that is evaluated and kept;
+    0: the weights themselves."""
+    noise: float = 6.7e-4
+    """Std of the random-walk noise on the last input velocity (length per frame)."""
+    noise_spread: float = 1.0
+    """Draw each sample's noise std log-uniformly between noise and this many times it."""
+    position_correction: float = 0.0
+    """Share of the last position's noise that the target undoes in one frame; 0: none, as GNS."""
+    mirror: bool = False
+    """Reflect every other sample along the first axis (for physics that is symmetric there)."""
+    seed: int = 0
+    """Seed of the weights, the data order and the noise."""
+    device: Device = "auto"
+    """auto: a GPU where there is one."""
+    workers: int = 0
+    """Processes that load data and build graphs; 0: the main one does."""
+    threads: int | None = None
+    """CPU threads of torch; None: torch's own choice."""
+    validate_every: int = 5_000
+    """Steps between validations."""
+    validate_trajectories: int = 4
+    """Validation trajectories that are rolled out."""
+    validate_horizon: int = 200
+    """Frames of those rollouts."""
+    checkpoint_every: int = 1_000
+    """Steps between checkpoints."""
+    test_trajectories: int | None = None
+    """Test trajectories rolled out at the end; None: all."""
+    test_horizon: int | None = 200
+    """Frames of those rollouts; None: to the end."""
+
+
+T = TypeVar("T")
+
+def torch_device(name: Device) -> torch.device:
+    """The device that ``name`` means on this machine."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device: got cuda, but torch finds no GPU here; accepted are auto and cpu")
+    return torch.device("cuda" if name == "auto" and torch.cuda.is_available() else name.replace("auto", "cpu"))
+
+
+_converter = make_converter(forbid_extra_keys=True)
+_converter.register_unstructure_hook(Path, str)
+_converter.register_structure_hook(Path, lambda value, _: Path(value))
+
+
+class ConfigError(ValueError):
+    """A configuration with unknown keys or values of a wrong kind."""
+
+
+def to_json(config: object) -> dict[str, Any]:
+    """A configuration as JSON types."""
+    result: dict[str, Any] = _converter.unstructure(config)
+    return result
+
+
+def from_json(kind: type[T], values: dict[str, Any], *, source: str) -> T:
+    """The configuration of dataclass ``kind`` that :func:`to_json` gave; unknown keys are refused.
+
+    ``source`` names where the values came from, for the message of :class:`ConfigError`.
+    """
+    try:
+        return _converter.structure(values, kind)
+    except cattrs.BaseValidationError as error:
+        problems = "; ".join(cattrs.transform_error(error))
+        raise ConfigError(f"configuration {source}: {problems}") from error

@@ -1,0 +1,333 @@
+"""`python -m adaptgns.evaluate`: measure rollouts against the truth and each other.
+
+Writes metrics.json and prints a table with a row for each rollout file, and for two baselines on
+the same trajectories. The measures are defined in :mod:`adaptgns.metrics`.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+
+from adaptgns.baselines import GRAVITY, constant_gravity, constant_velocity
+from adaptgns.data.metadata import Metadata
+from adaptgns.graph_statistics import GraphStatistics, graph_statistics
+from adaptgns.metrics import (
+    Floats,
+    calibration,
+    clumping,
+    edge_counts,
+    kinetic_energy,
+    kinetic_energy_error,
+    one_step_mse,
+    position_mse,
+    spearman,
+)
+from adaptgns.report import Measures, Report
+from adaptgns.rollout_file import Rollout, RolloutFile
+
+METRICS = "metrics.json"
+MARKS = (50, 100, 200)
+STATISTICS_STEP = 100
+"""Step of the graph statistics, as in table 2 of the paper"""
+DECILES = 10
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Measure rollouts of one set of trajectories."""
+
+    rollouts: tuple[Path, ...]
+    """Rollout files (HDF5), all of the same trajectories."""
+    out: Path | None = None
+    """Folder for metrics.json; None: that of the first rollout file."""
+    steps: tuple[int, ...] = MARKS
+    """Predicted frames at which errors are reported."""
+
+
+def evaluate(
+    files: Sequence[Path],
+    marks: Sequence[int] = MARKS,
+    *,
+    out: Path | None = None,
+    console: Console | None = None,
+) -> Report:
+    """Measure the rollouts in ``files``, at the steps ``marks`` among others.
+
+    With ``out``, the report is written to metrics.json in this folder; with ``console``, printed.
+    ValueError where the files hold rollouts of different trajectories.
+    """
+    report = measure(files, marks)
+    if out is not None:
+        report.write(out / METRICS)
+    if console is not None:
+        report.print(console)
+    return report
+
+
+def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
+    """As :func:`evaluate`, neither writing nor printing."""
+    if not files:
+        raise ValueError("rollouts: got no file; expected one or more")
+    if any(mark < 1 for mark in marks):
+        raise ValueError(f"steps: got {list(marks)}; steps are counted from 1")
+    marks = sorted(set(marks))
+    with ExitStack() as stack:
+        opened = [stack.enter_context(RolloutFile(path)) for path in files]
+        check_same_trajectories(opened)
+        first = opened[0]
+        names = [rollout.name for rollout in first]
+        shortest = min(rollout.steps for file in opened for rollout in file)
+        statistics_step = min(STATISTICS_STEP, shortest)
+        truth_statistics: list[GraphStatistics] = []
+        tallies = [Tally() for _ in opened]
+        baselines: dict[str, Tally] = defaultdict(Tally)
+        for rollouts in zip(*opened, strict=True):
+            truth = Truth.of(max(rollouts, key=lambda rollout: rollout.steps), first)
+            truth_statistics.append(truth.statistics(truth.positions, statistics_step))
+            for tally, rollout in zip(tallies, rollouts, strict=True):
+                predicted = rollout.predicted
+                tally.add_positions(truth, predicted, marks)
+                tally.add_graph(rollout)
+                tally.add_one_step(rollout, truth)
+                tally.statistics.append(truth.statistics(predicted, statistics_step))
+            for name, predicted in baseline_predictions(truth):
+                baselines[name].add_positions(truth, predicted, marks)
+        measures = [
+            tally.measures(file.label, describe_policy(file), file)
+            for tally, file in zip(tallies, opened, strict=True)
+        ]
+        return Report(
+            marks=marks,
+            trajectories=names,
+            rollouts=measures,
+            baselines=[tally.measures(name, "") for name, tally in baselines.items()],
+            statistics_step=statistics_step,
+            true_statistics=truth_statistics,
+            notes=[*short_notes(measures, marks), *unit_notes(opened)],
+        )
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The true course of one trajectory, and what all predictions of it are measured with."""
+
+    initial: NDArray[np.float32]
+    """``[H, N, d]``"""
+    positions: NDArray[np.float32]
+    """``[K, N, d]``"""
+    mobile: NDArray[np.bool_]
+    """``[N]``"""
+    metadata: Metadata
+    edges: NDArray[np.float64]
+    """``[K]``, of :func:`adaptgns.metrics.edge_counts`"""
+
+    @classmethod
+    def of(cls, rollout: Rollout, file: RolloutFile) -> Truth:
+        """Of the trajectory that ``rollout`` predicts."""
+        mobile, metadata, true = file.mobile(rollout.particle_type), file.metadata, rollout.true
+        edges = edge_counts(true, metadata.radius, mobile, metadata.box)
+        return cls(rollout.initial, true, mobile, metadata, edges)
+
+    def kinetic_energy(self, positions: Floats) -> NDArray[np.float64]:
+        """``[K]`` of positions ``[K, N, d]`` that follow the initial ones."""
+        course = np.concatenate([self.initial[-1:], positions])
+        return kinetic_energy(course, self.mobile, self.metadata.dt, self.metadata.box)
+
+    def statistics(self, positions: Floats, step: int) -> GraphStatistics:
+        """Of the radius graph on ``positions`` ``[K, N, d]`` after ``step`` steps."""
+        return graph_statistics(positions[step - 1], self.metadata.radius, self.metadata.box)
+
+
+@dataclass
+class Tally:
+    """The measures of one way of predicting, gathered trajectory by trajectory."""
+
+    scalars: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    curves: dict[str, list[NDArray[np.float64]]] = field(default_factory=lambda: defaultdict(list))
+    squared_error: list[NDArray[np.float32]] = field(default_factory=list)
+    variance: list[NDArray[np.float32]] = field(default_factory=list)
+    statistics: list[GraphStatistics] = field(default_factory=list)
+    dim: int = 0
+
+    def add_positions(self, truth: Truth, predicted: Floats, marks: Iterable[int]) -> None:
+        """Measure predicted positions ``[K, N, d]``."""
+        steps, metadata = len(predicted), truth.metadata
+        true = truth.positions[:steps]
+        edges = edge_counts(predicted, metadata.radius, truth.mobile, metadata.box)
+        energy = truth.kinetic_energy(predicted)
+        true_energy = truth.kinetic_energy(true)
+        curves = {
+            "mse": position_mse(predicted, true, truth.mobile, metadata.box),
+            "clumping": clumping(edges, truth.edges[:steps]),
+            "kinetic_energy": energy,
+            "kinetic_energy_true": true_energy,
+        }
+        for name, curve in curves.items():
+            self.curves[name].append(curve)
+        for mark in marks:
+            if mark <= steps:
+                self.scalars[f"mse@{mark}"].append(curves["mse"][mark - 1])
+                self.scalars[f"clumping@{mark}"].append(curves["clumping"][mark - 1])
+        self.scalars["mse"].append(float(curves["mse"].mean()))
+        self.scalars["clumping"].append(float(curves["clumping"].mean()))
+        self.scalars["kinetic_energy_error"].append(kinetic_energy_error(energy, true_energy))
+
+    def add_graph(self, rollout: Rollout) -> None:
+        """Note what the graphs cost: their edges, and the median times of a step."""
+        edges = rollout.edges.astype(np.float64)
+        self.curves["edges"].append(edges)
+        self.scalars["edges_per_step"].append(float(edges.mean()))
+        self.scalars["graph_ms"].append(float(np.median(rollout.graph_ms)))
+        self.scalars["model_ms"].append(float(np.median(rollout.model_ms)))
+
+    def add_one_step(self, rollout: Rollout, truth: Truth) -> None:
+        """Measure the single steps from true positions, where there are any."""
+        one_step = rollout.one_step
+        if one_step is None:
+            return
+        self.dim = truth.positions.shape[2]
+        mse = one_step_mse(one_step.squared_error, truth.mobile, self.dim)
+        self.scalars["one_step_mse"].append(mse)
+        if one_step.variance is not None:
+            self.squared_error.append(one_step.squared_error[:, truth.mobile].ravel())
+            self.variance.append(one_step.variance[:, truth.mobile].ravel())
+
+    def measures(self, label: str, policy: str, file: RolloutFile | None = None) -> Measures:
+        """All of it. A scalar that not every trajectory has is left out."""
+        count = len(self.curves["mse"])
+        horizon = min(len(curve) for curve in self.curves["mse"])
+        error, variance = (
+            np.concatenate(pool) if pool else np.empty(0, dtype=np.float32)
+            for pool in (self.squared_error, self.variance)
+        )
+        return Measures(
+            label=label,
+            policy=policy,
+            scalars={
+                name: np.array(values)
+                for name, values in self.scalars.items()
+                if len(values) == count
+            },
+            curves={
+                name: np.mean([curve[:horizon] for curve in curves], axis=0)
+                for name, curves in self.curves.items()
+            },
+            horizon=horizon,
+            spearman=spearman(variance, error) if len(error) >= DECILES else None,
+            calibration=calibration(variance, error, self.dim, DECILES)
+            if len(error) >= DECILES
+            else None,
+            statistics=self.statistics,
+            settings={} if file is None else file.settings,
+            file=None if file is None else str(file.path),
+        )
+
+
+def baseline_predictions(truth: Truth) -> list[tuple[str, NDArray[np.float64]]]:
+    """Name and positions ``[K, N, d]`` of each baseline; kinematic particles move as they do."""
+    steps, metadata = len(truth.positions), truth.metadata
+    bounds, box = metadata.bounds, metadata.box
+    predictions = [
+        ("constant velocity", constant_velocity(truth.initial, steps, bounds, box=box)),
+    ]
+    if not metadata.periodic[-1]:
+        gravity = GRAVITY * metadata.dt**2
+        fall = constant_gravity(truth.initial, steps, bounds, gravity, box=box)
+        predictions.append(("constant gravity", fall))
+    for _, predicted in predictions:
+        predicted[:, ~truth.mobile] = truth.positions[:, ~truth.mobile]
+    return predictions
+
+
+def describe_policy(file: RolloutFile) -> str:
+    """Policy and, where it is not the trained one, radius of the graph."""
+    trained = file.settings.get("trained_radius")
+    if trained is None or file.graph_radius == trained:
+        return file.policy
+    return f"{file.policy}, r = {file.graph_radius:g}"
+
+
+def check_same_trajectories(files: Sequence[RolloutFile]) -> None:
+    """Raise ValueError unless all ``files`` predict the same trajectories."""
+    first = files[0]
+    if len(first) == 0:
+        raise ValueError(f"rollouts: {first.path} holds no trajectory")
+    for file in files[1:]:
+        difference = _difference(first, file)
+        if difference is not None:
+            raise ValueError(
+                f"rollouts: {first.path} and {file.path} can't be compared, {difference}; expected "
+                "rollouts of the same trajectories"
+            )
+
+
+def _difference(first: RolloutFile, second: RolloutFile) -> str | None:
+    """What keeps two files from being compared, in words."""
+    if len(first) != len(second):
+        return f"they hold {len(first)} and {len(second)} trajectories"
+    for name in ("dim", "dt", "radius", "bounds", "periodic", "kinematic_types"):
+        one, other = (getattr(file.metadata, name) for file in (first, second))
+        if one != other:
+            return f"their metadata differ in {name}: {one} and {other}"
+    for index, (one, other) in enumerate(zip(first, second, strict=True)):
+        steps = min(one.steps, other.steps)
+        tensors: Mapping[str, tuple[NDArray[np.generic], NDArray[np.generic]]] = {
+            "particle types": (one.particle_type, other.particle_type),
+            "initial positions": (one.initial, other.initial),
+            "true positions": (one.true[:steps], other.true[:steps]),
+        }
+        for name, pair in tensors.items():
+            if not np.array_equal(*pair):
+                return f"trajectory {index} ({one.name}, {other.name}) differs in its {name}"
+    return None
+
+
+def short_notes(measures: Sequence[Measures], marks: Sequence[int]) -> list[str]:
+    """Which marks lie past the end of which rollouts."""
+    return [
+        f"no figure at step {', '.join(map(str, missed))} for {row.name}: its shortest rollout has "
+        f"{row.horizon} steps"
+        for row in measures
+        if (missed := [mark for mark in marks if mark > row.horizon])
+    ]
+
+
+def unit_notes(files: Sequence[RolloutFile]) -> list[str]:
+    """A warning where normalized units differ between the files."""
+    units = {
+        (tuple(file.metadata.acceleration_std), file.settings.get("training", {}).get("noise"))
+        for file in files
+    }
+    if len(units) == 1:
+        return []
+    return [
+        "the models were trained with different statistics or noise, so that one-step MSE and "
+        "calibration, which are in normalized units, can't be compared between them"
+    ]
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command with ``argv``, or with the process's own arguments."""
+    config = tyro.cli(EvaluateConfig, args=argv, description=__doc__)
+    console = Console()
+    out = config.rollouts[0].parent if config.out is None and config.rollouts else config.out
+    try:
+        evaluate(config.rollouts, config.steps, out=out, console=console)
+    except (ValueError, OSError) as error:
+        console.print(f"error: {error}", markup=False, style="red", soft_wrap=True)
+        raise SystemExit(2) from None
+    assert out is not None  # without a file evaluate raises
+    console.print(str(out / METRICS), highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,326 @@
+"""The training loop: steps, validation, checkpoints, and what stops it."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from adaptgns.checkpoint import BEST, LAST, Checkpoint, build_simulator, with_prefix, write_checkpoint
+from adaptgns.config import HISTORY, TrainConfig, torch_device
+from adaptgns.data.metadata import Metadata
+from adaptgns.data.trajectories import Trajectories
+from adaptgns.losses import training_loss
+from adaptgns.policies import Edges, Fixed, State
+from adaptgns.rollout import steps as rollout_steps
+from adaptgns.rollout import to_sigma
+from adaptgns.segment import Graph
+from adaptgns.simulator import Simulator
+from adaptgns.windows import Batch, Windows, training_batches
+
+LOG_EVERY = 100
+"""Steps between lines of the metrics log."""
+
+
+class TrainingStopped(Exception):
+    """Training ended before its last step; the message says why and how to go on."""
+
+
+class Trainer:
+    """A run: its simulator, optimizer and averaged weights, and the step they are at."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        metadata: Metadata,
+        folder: Path,
+        train: Trajectories,
+        valid: Trajectories | None,
+        checkpoint: Checkpoint | None = None,
+    ) -> None:
+        self.config, self.metadata, self.folder, self.valid = config, metadata, folder, valid
+        self.device = torch_device(config.device)
+        torch.manual_seed(config.seed)
+        self.simulator = build_simulator(config, metadata).to(self.device)
+        self.optimizer = torch.optim.Adam(self.simulator.parameters(), fused=True)
+        self.average: dict[str, Tensor] = {}
+        self.step = 0
+        self.best_score = math.inf
+        if checkpoint is not None:
+            self._restore(checkpoint)
+        elif config.average:
+            self.average = {k: v.clone() for k, v in self.simulator.state_dict().items()}
+        self.windows = Windows(train, metadata, config, noise=config.noise)
+        if not len(self.windows):
+            raise ValueError(
+                f"{train.path}: no trajectory has the {self.windows.frames} frames that a sample needs"
+            )
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        self.simulator.load_state_dict(checkpoint.group("model"))
+        self.average = {k: v.to(self.device) for k, v in checkpoint.group("average").items()}
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, tensor in checkpoint.group("optimizer").items():
+            index, key = name.split(".")
+            state.setdefault(int(index), {})[key] = tensor
+        groups = self.optimizer.state_dict()["param_groups"]
+        self.optimizer.load_state_dict({"state": state, "param_groups": groups})
+        self.step, self.best_score = checkpoint.step, checkpoint.best_score
+
+    def checkpoint(self, *, resumable: bool) -> Checkpoint:
+        """The run as it stands; ``resumable`` with all that training needs to go on."""
+        tensors = with_prefix("model", self.simulator.state_dict())
+        if self.average:
+            averaged = with_prefix("average", self.average)
+            tensors = {**tensors, **averaged} if resumable else averaged
+        if resumable:
+            for index, state in self.optimizer.state_dict()["state"].items():
+                tensors |= with_prefix(f"optimizer.{index}", state)
+        return Checkpoint(self.config, self.metadata, self.step, self.best_score, tensors)
+
+    def save(self) -> None:
+        """Write the checkpoint that training goes on from."""
+        write_checkpoint(self.folder / LAST, self.checkpoint(resumable=True))
+
+    def run(self, console: Console) -> None:
+        """Train to the last step.
+
+        Raises :class:`TrainingStopped` on SIGINT, SIGTERM (after saving) and a loss that is not
+        finite (the last good checkpoint stays).
+        """
+        config = self.config
+        batches = iter(
+            training_batches(self.windows, config, self.step, pin=self.device.type == "cuda")
+        )
+        progress = Progress(
+            TextColumn("training"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("loss {task.fields[loss]}  {task.fields[speed]} steps/s"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+        )
+        self.simulator.train()
+        losses: list[Tensor] = []
+        with (
+            Log(self.folder, self.step) as log,
+            interruption() as interrupted,
+            progress,
+        ):
+            task = progress.add_task("", total=config.steps, completed=self.step, loss="-", speed="-")
+            logged = time.perf_counter()
+            while self.step < config.steps:
+                losses.append(self.train_step(next(batches).to(self.device)))
+                self.step += 1
+                progress.advance(task)
+                last = self.step == config.steps
+                if self.step % LOG_EVERY == 0 or last:
+                    loss = self._mean_loss(losses)
+                    speed = len(losses) / (time.perf_counter() - logged)
+                    log.write(
+                        self.step, {"loss": loss, "lr": self.learning_rate(), "steps_per_second": speed}
+                    )
+                    progress.update(task, loss=f"{loss:.4g}", speed=f"{speed:.1f}")
+                    losses.clear()
+                    logged = time.perf_counter()
+                if self.valid is not None and (self.step % config.validate_every == 0 or last):
+                    self._mean_loss(losses)
+                    self._validate(log)
+                    logged = time.perf_counter()
+                if self.step % config.checkpoint_every == 0 or last or interrupted:
+                    self._mean_loss(losses)
+                    self.save()
+                if interrupted and not last:
+                    raise TrainingStopped(
+                        f"stopped by {interrupted[0]} after step {self.step}; nothing is lost. Go on with\n"
+                        f"  python -m adaptgns.train --resume {self.folder}"
+                    )
+
+    def train_step(self, batch: Batch) -> Tensor:
+        """One optimizer step on ``batch``; the loss before it."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate()
+        graph = self._lagged_graph(batch) if self.config.graph == "adaptive" else batch.graph
+        prediction = self.simulator(batch.window, batch.particle_type, graph, batch.material)
+        target = self.simulator.target(batch.window, batch.following)
+        loss = training_loss(self.config.loss, prediction, target, batch.mobile)
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        if self.config.clip is not None:
+            torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), self.config.clip)
+        self.optimizer.step()
+        if self.average:
+            with torch.no_grad():
+                # Short memory at first: the initial weights should not linger.
+                decay = min(self.config.average, (1 + self.step) / (10 + self.step))
+                torch._foreach_lerp_(
+                    list(self.average.values()), list(self.simulator.state_dict().values()), 1 - decay
+                )
+        return loss.detach()
+
+    def learning_rate(self) -> float:
+        """The learning rate of the current step."""
+        c = self.config
+        if self.step < c.warmup:
+            return c.lr * (self.step + 1) / c.warmup
+        if c.schedule == "exponential":
+            return c.lr_final + (c.lr - c.lr_final) * 0.1 ** (self.step / 5e6)
+        progress = (self.step - c.warmup) / max(1, c.steps - c.warmup)
+        return c.lr_final + (c.lr - c.lr_final) * 0.5 * (1 + math.cos(math.pi * progress))
+
+    def _lagged_graph(self, batch: Batch) -> Graph:
+        """The adaptive graph that a rollout would have here: its sigma comes from a pass without
+        gradient over the window one frame earlier, on that window's base graph."""
+        rule, mobile = self.config.adaptive, batch.mobile.cpu().numpy()
+
+        def state(window: Tensor, sigma: NDArray[np.float32] | None) -> State:
+            return State(
+                positions=window[:, -1].cpu().numpy(),
+                sigma=sigma,
+                mobile=mobile,
+                radius=self.simulator.radius,
+                self_edges=self.config.model.self_edges,
+                box=self.metadata.box,
+                ptr=batch.ptr.cpu().numpy(),
+                predict_sigma=predict_sigma,
+            )
+
+        def predict_sigma(edges: Edges) -> NDArray[np.float32]:
+            graph = Graph.from_numpy(*edges).to(self.device)
+            with torch.no_grad():
+                prediction = self.simulator(
+                    batch.earlier_window, batch.particle_type, graph, batch.material
+                )
+            return to_sigma(prediction)
+
+        sigma = predict_sigma(state(batch.earlier_window, None).base())
+        return Graph.from_numpy(*state(batch.window, sigma).expanded(sigma, rule)).to(self.device)
+
+    def _mean_loss(self, losses: list[Tensor]) -> float:
+        """Mean of ``losses``; raises :class:`TrainingStopped` unless it is finite."""
+        if not losses:
+            return math.nan
+        mean = float(torch.stack(losses).mean())
+        if not math.isfinite(mean):
+            raise TrainingStopped(
+                f"the loss became {mean} between steps {self.step - len(losses)} and {self.step}. "
+                f"{self.folder / LAST} holds the last good state. Look at: the learning rate "
+                f"(--lr, now {self.config.lr}), gradient clipping (--clip), and the data "
+                f"(python -m adaptgns.inspect {self.config.data})"
+            )
+        return mean
+
+    def evaluated(self) -> Simulator:
+        """The simulator that rollouts use: the averaged weights where the run keeps them."""
+        return self.checkpoint(resumable=False).simulator().to(self.device)
+
+    def _validate(self, log: Log) -> None:
+        assert self.valid is not None
+        scores = validate(self.evaluated(), self.valid, self.config)
+        log.write(self.step, scores)
+        if scores["valid_rollout_mse"] < self.best_score:
+            self.best_score = scores["valid_rollout_mse"]
+            write_checkpoint(self.folder / BEST, self.checkpoint(resumable=False))
+
+
+def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> dict[str, float]:
+    """One-step and rollout errors on the first validation trajectories, on the base graph.
+
+    ``valid_rollout_mse`` is the mean over steps, particles and dimensions of the squared position
+    error; ``valid_one_step`` the squared error of the normalized acceleration, summed over
+    dimensions, on true inputs at every tenth frame of the first trajectories.
+    """
+    curves, one_step = [], []
+    for index in range(min(len(valid), config.validate_trajectories)):
+        trajectory = valid[index]
+        true = trajectory.positions[HISTORY:]
+        count = min(config.validate_horizon, len(true))
+        mobile = ~np.isin(trajectory.particle_type, simulator.metadata.kinematic_types)
+        rolled = list(rollout_steps(simulator, trajectory, Fixed(), count))
+        box = simulator.metadata.box
+        error = np.stack([s.positions for s in rolled]) - true[:count]
+        if box is not None:
+            periodic = np.isfinite(box)
+            error[..., periodic] -= box[periodic] * np.round(error[..., periodic] / box[periodic])
+        curves.append(np.square(error[:, mobile], dtype=np.float64).mean((1, 2)))
+        one_step.append(rolled[0].squared_error[mobile].mean(dtype=np.float64))
+    shortest = min(map(len, curves))
+    curve = np.mean([c[:shortest] for c in curves], axis=0)
+    scores = {f"valid_mse_{k}": float(curve[k - 1]) for k in (50, 100, 200) if k <= shortest}
+    return {"valid_rollout_mse": float(curve.mean()), "valid_one_step": float(np.mean(one_step)), **scores}
+
+
+class Log:
+    """Metrics as JSON lines in ``metrics.jsonl`` and as TensorBoard events.
+
+    Opened at a step, it forgets what an interrupted run logged past that step.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        path = folder / "metrics.jsonl"
+        kept = []
+        if path.exists():
+            for line in path.read_text().splitlines(keepends=True):
+                # A killed run may leave half a line.
+                if line.endswith("\n") and json.loads(line)["step"] <= step:
+                    kept.append(line)
+        path.write_text("".join(kept))
+        self.file = path.open("a")
+        self.board = SummaryWriter(folder / "tensorboard", purge_step=step + 1)
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        """Log ``values`` at ``step``."""
+        self.file.write(json.dumps({"step": step, **values}) + "\n")
+        self.file.flush()
+        for name, value in values.items():
+            self.board.add_scalar(name, value, step)
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.file.close()
+        self.board.close()
+
+
+@contextmanager
+def interruption() -> Iterator[list[str]]:
+    """A list that stays empty until SIGINT or SIGTERM arrives, which then names the signal.
+
+    A second signal acts as it would have without this.
+    """
+    received: list[str] = []
+    previous = {}
+
+    def note(number: int, _: FrameType | None) -> None:
+        received.append(signal.Signals(number).name)
+        signal.signal(number, previous[number])
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        previous[number] = signal.signal(number, note)
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,0 +1,27 @@
+"""Training losses, each a mean over the particles that carry one."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from adaptgns.config import Loss
+from adaptgns.network import Prediction
+
+
+def training_loss(kind: Loss, prediction: Prediction, target: Tensor, mobile: Tensor) -> Tensor:
+    """The loss ``kind`` of normalized ``target`` accelerations ``[N, d]``; a scalar.
+
+    ``mobile`` ``[N]`` marks the non-kinematic particles; the others count nothing. NaN surfaces.
+
+    - ``mse``: mean over particles and dimensions of the squared error.
+    - ``nll``: mean over particles of |a' - a|^2 / (2 s^2) + (d/2) log s^2, the Gaussian negative
+      log-likelihood up to a constant, with one variance s^2 per particle (Nix & Weigend 1994).
+    """
+    squared_error = (prediction.acceleration - target).square().sum(1)[mobile]  # [M]
+    dim = target.shape[1]
+    if kind == "mse":
+        return squared_error.mean() / dim
+    if prediction.variance is None:
+        raise ValueError(f"loss: {kind} needs a network with a variance head; this one has none")
+    variance = prediction.variance[mobile]
+    return (squared_error / (2 * variance) + dim / 2 * variance.log()).mean()

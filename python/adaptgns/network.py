@@ -1,0 +1,115 @@
+"""Encode-process-decode graph network (Sanchez-Gonzalez et al. 2020) with a variance head.
+
+Shapes: N particles, E edges, L latent width.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from adaptgns.segment import Graph, at_receivers, at_senders, sum_at_receivers
+
+VARIANCE_FLOOR = 1e-8
+"""Smallest variance the head can predict, in normalized units squared."""
+
+
+class Prediction(NamedTuple):
+    """What the network says of every particle, in normalized units."""
+
+    acceleration: Tensor
+    """``[N, d]``"""
+    variance: Tensor | None
+    """``[N]``, the variance per dimension; None for a network without a variance head."""
+
+
+def mlp(inputs: int, width: int, hidden_layers: int, outputs: int, *, norm: bool) -> nn.Sequential:
+    """``hidden_layers`` ReLU layers of ``width``, a linear output, a LayerNorm after it if asked."""
+    sizes = [inputs, *[width] * hidden_layers]
+    layers: list[nn.Module] = []
+    for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+        layers += [nn.Linear(a, b), nn.ReLU()]
+    layers.append(nn.Linear(sizes[-1], outputs))
+    if norm:
+        layers.append(nn.LayerNorm(outputs))
+    return nn.Sequential(*layers)
+
+
+class InteractionLayer(nn.Module):
+    """One message-passing step: edges from their ends, nodes from their summed incoming edges.
+
+    The first edge layer acts on [receiver, sender, edge]. A linear map of a concatenation is the
+    sum of maps of its parts, so the node parts are multiplied once per node, not once per edge.
+    """
+
+    def __init__(self, latent: int, hidden_layers: int) -> None:
+        super().__init__()
+        self.edge_mlp = mlp(3 * latent, latent, hidden_layers, latent, norm=True)
+        self.node_mlp = mlp(2 * latent, latent, hidden_layers, latent, norm=True)
+
+    def forward(self, nodes: Tensor, edges: Tensor, graph: Graph) -> tuple[Tensor, Tensor]:
+        """Updated nodes ``[N, L]`` and edges ``[E, L]``, residuals included."""
+        first = self.edge_mlp[0]
+        assert isinstance(first, nn.Linear)
+        receiver_part, sender_part, edge_part = first.weight.chunk(3, dim=1)
+        hidden = F.linear(edges, edge_part, first.bias)  # [E, L]
+        hidden = hidden + at_receivers(F.linear(nodes, receiver_part), graph)
+        hidden = hidden + at_senders(F.linear(nodes, sender_part), graph)
+        messages = self.edge_mlp[1:](hidden)
+        incoming = sum_at_receivers(messages, graph)  # [N, L]
+        update = self.node_mlp(torch.cat([incoming, nodes], dim=1))
+        return nodes + update, edges + messages
+
+
+class EncodeProcessDecode(nn.Module):
+    """Node and edge features to normalized accelerations and their variance.
+
+    Without ``edges`` it is the per-particle baseline: the same encoder, node updates, decoder and
+    variance head, and no message ever arrives.
+    """
+
+    def __init__(
+        self,
+        node_features: int,
+        edge_features: int,
+        outputs: int,
+        *,
+        latent: int,
+        hidden_layers: int,
+        steps: int,
+        edges: bool,
+        variance: bool,
+    ) -> None:
+        super().__init__()
+        self.node_encoder = mlp(node_features, latent, hidden_layers, latent, norm=True)
+        self.edge_encoder = (
+            mlp(edge_features, latent, hidden_layers, latent, norm=True) if edges else None
+        )
+        self.layers = nn.ModuleList(
+            InteractionLayer(latent, hidden_layers)
+            if edges
+            else mlp(latent, latent, hidden_layers, latent, norm=True)
+            for _ in range(steps)
+        )
+        self.decoder = mlp(latent, latent, hidden_layers, outputs, norm=False)
+        self.variance_head = mlp(latent, latent, 1, 1, norm=False) if variance else None
+
+    def forward(
+        self, node_features: Tensor, edge_features: Tensor | None, graph: Graph | None
+    ) -> Prediction:
+        """Predictions for ``node_features`` ``[N, :]`` and ``edge_features`` ``[E, :]``."""
+        nodes = self.node_encoder(node_features)
+        if self.edge_encoder is None:
+            for layer in self.layers:
+                nodes = nodes + layer(nodes)
+        else:
+            edges = self.edge_encoder(edge_features)
+            for layer in self.layers:
+                nodes, edges = layer(nodes, edges, graph)
+        variance = None
+        if self.variance_head is not None:
+            variance = F.softplus(self.variance_head(nodes)).squeeze(1) + VARIANCE_FLOOR
+        return Prediction(self.decoder(nodes), variance)

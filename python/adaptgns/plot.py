@@ -1,0 +1,76 @@
+"""`python -m adaptgns.plot`: pictures of rollouts.
+
+animate: a GIF with the truth on the left and the prediction on the right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from adaptgns.animation import Animation
+from adaptgns.rollout_file import RolloutFile
+
+
+@dataclass(frozen=True)
+class AnimateConfig:
+    """Animate one trajectory of a rollout file: truth on the left, prediction on the right."""
+
+    rollout: Path
+    """Rollout file (HDF5)."""
+    out: Path
+    """GIF file to write."""
+    trajectory: int = 0
+    """Which trajectory of the file, counted from 0."""
+    every: int = 4
+    """Steps from one picture to the next."""
+    fps: int = 25
+    """Pictures per second."""
+
+
+def animate(
+    rollout: Path, out: Path, *, trajectory: int = 0, every: int = 4, fps: int = 25
+) -> None:
+    """Write an animation of one trajectory of a rollout file to the GIF ``out``.
+
+    Particles of the truth are coloured by their speed, those of the prediction by their sigma (by
+    speed too, for a model without a variance head), both scales fixed over the animation. For the
+    policy ``adaptive`` the extra edges are drawn that the next step sees beyond the base radius.
+    Below run the number of edges and the position error. ``every`` counts the steps from one
+    picture to the next, of ``fps`` per second. 3D is seen from an elevated corner.
+    """
+    if every < 1 or not 1 <= fps <= 50:
+        raise ValueError(
+            f"every, fps: got {every} and {fps}; accepted are every >= 1 and fps from 1 to 50"
+        )
+    with RolloutFile(rollout) as file:
+        Animation(file, file[trajectory], every).write(out, fps)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command with ``argv``, or with the process's own arguments."""
+    config = tyro.extras.subcommand_cli_from_dict(
+        {"animate": AnimateConfig}, args=argv, description=__doc__
+    )
+    console = Console()
+    try:
+        animate(
+            config.rollout,
+            config.out,
+            trajectory=config.trajectory,
+            every=config.every,
+            fps=config.fps,
+        )
+    except (ValueError, IndexError, OSError) as error:
+        console.print(f"error: {error}", markup=False, style="red", soft_wrap=True)
+        raise SystemExit(2) from None
+    console.print(str(config.out), highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""Which particles see which: the graph policies of a rollout.
+
+A policy gets the state before a step and returns the edges of that step. Kinematic particles are
+never high: their sigma is not trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptgns._core import adaptive_graph, knn_graph, radius_graph
+from adaptgns.config import AdaptiveConfig, PolicyName
+
+Edges = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""``[2, E]`` senders and receivers, and the receivers' row offsets ``[N + 1]``"""
+
+
+@dataclass(frozen=True)
+class State:
+    """What a policy may look at before a step."""
+
+    positions: NDArray[np.float32]
+    """``[N, d]``"""
+    sigma: NDArray[np.float32] | None
+    """``[N]``, predicted one step ago; None before the first step"""
+    mobile: NDArray[np.bool_]
+    """``[N]``, the non-kinematic particles"""
+    radius: float
+    """Base radius of the graph (length units of the data)"""
+    self_edges: bool
+    box: NDArray[np.float64] | None
+    """``[d]`` period lengths, inf along open axes"""
+    predict_sigma: Callable[[Edges], NDArray[np.float32]]
+    """A forward pass of the model on given edges, for its sigma ``[N]`` alone"""
+    ptr: NDArray[np.int64] | None = None
+    """``[B + 1]`` offsets of independent systems"""
+
+    def base(self) -> Edges:
+        """The radius graph."""
+        return radius_graph(
+            self.positions,
+            self.radius,
+            ptr=self.ptr,
+            box=self.box,
+            self_edges=self.self_edges,
+            return_offsets=True,
+        )
+
+    def expanded(self, sigma: NDArray[np.float32], rule: AdaptiveConfig) -> Edges:
+        """The adaptive graph for ``sigma`` ``[N]``."""
+        return adaptive_graph(
+            self.positions,
+            sigma,
+            self.radius,
+            rule.tau,
+            rule.factor,
+            ptr=self.ptr,
+            box=self.box,
+            self_edges=self.self_edges,
+            eligible=self.mobile,
+            return_offsets=True,
+        )
+
+
+class Policy(Protocol):
+    """Chooses the graph of every step."""
+
+    def edges(self, state: State) -> Edges:
+        """The edges of the step that starts in ``state``."""
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """All pairs within the base radius."""
+
+    def edges(self, state: State) -> Edges:
+        return state.base()
+
+
+@dataclass(frozen=True)
+class Adaptive:
+    """The particles most uncertain one step ago see farther; the first step has the base graph."""
+
+    rule: AdaptiveConfig
+
+    def edges(self, state: State) -> Edges:
+        return state.base() if state.sigma is None else state.expanded(state.sigma, self.rule)
+
+
+@dataclass(frozen=True)
+class TwoPass:
+    """The particles most uncertain now see farther, at the price of a second forward pass: what
+    the lag of :class:`Adaptive` costs in accuracy."""
+
+    rule: AdaptiveConfig
+
+    def edges(self, state: State) -> Edges:
+        return state.expanded(state.predict_sigma(state.base()), self.rule)
+
+
+@dataclass(frozen=True)
+class Random:
+    """The same share of particles as in :class:`Adaptive`, drawn anew at every step: the control."""
+
+    rule: AdaptiveConfig
+    rng: np.random.Generator
+
+    def edges(self, state: State) -> Edges:
+        if state.sigma is None:
+            return state.base()
+        return state.expanded(self.rng.random(len(state.positions), dtype=np.float32), self.rule)
+
+
+@dataclass(frozen=True)
+class NearestNeighbours:
+    """The k nearest particles of each, at any distance."""
+
+    k: int
+
+    def edges(self, state: State) -> Edges:
+        return knn_graph(
+            state.positions, self.k, ptr=state.ptr, box=state.box, self_edges=state.self_edges, return_offsets=True
+        )
+
+
+def make_policy(name: PolicyName, rule: AdaptiveConfig, *, k: int, seed: int) -> Policy:
+    """The policy called ``name``; ``seed`` matters for ``random`` alone, ``k`` for ``knn``."""
+    match name:
+        case "fixed":
+            return Fixed()
+        case "adaptive":
+            return Adaptive(rule)
+        case "two-pass":
+            return TwoPass(rule)
+        case "random":
+            return Random(rule, np.random.default_rng(seed))
+        case "knn":
+            return NearestNeighbours(k)

@@ -1,0 +1,35 @@
+"""The named sets of defaults that a training run starts from."""
+
+from __future__ import annotations
+
+from adaptgns.config import ModelConfig, Preset, TrainConfig
+
+PRESETS: dict[Preset, TrainConfig] = {
+    # Seconds: that everything works.
+    "smoke": TrainConfig(
+        preset="smoke",
+        model=ModelConfig(latent=16, hidden_layers=1, steps=2),
+        steps=60,
+        lr=1e-3,
+        schedule="cosine",
+        validate_every=30,
+        validate_trajectories=1,
+        validate_horizon=20,
+        checkpoint_every=20,
+        test_trajectories=2,
+        test_horizon=30,
+    ),
+    # About five minutes of training on two cores; docs/recipe.md says how it was found.
+    "laptop": TrainConfig(
+        preset="laptop",
+        model=ModelConfig(latent=64, steps=5),
+        steps=10_000,
+        lr=1e-3,
+        schedule="cosine",
+        warmup=200,
+        mirror=True,
+        test_trajectories=10,
+    ),
+    # The paper's sizes (and geoelements/gns's schedule).
+    "paper": TrainConfig(preset="paper", steps=2_000_000, validate_every=20_000, test_horizon=None),
+}

@@ -1,0 +1,191 @@
+"""`python -m adaptgns.rollout`: step a trained simulator forward over a split."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+
+from adaptgns.checkpoint import read_checkpoint
+from adaptgns.config import HISTORY, RolloutConfig, to_json, torch_device
+from adaptgns.data.trajectories import Trajectory, open_split
+from adaptgns.data.default import dataset_folder
+from adaptgns.network import Prediction
+from adaptgns.policies import Edges, Policy, State, make_policy
+from adaptgns.rollout_file import RolloutWriter
+from adaptgns.segment import Graph
+from adaptgns.simulator import Simulator
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a rollout."""
+
+    positions: NDArray[np.float32]
+    """``[N, d]``, predicted; kinematic particles as given"""
+    sigma: NDArray[np.float32] | None
+    """``[N]``, square root of the predicted variance, normalized units"""
+    squared_error: NDArray[np.float32]
+    """``[N]``, of the acceleration that would lead to the true next position, summed over
+    dimensions, normalized units"""
+    edges: int
+    """Directed edges without self-edges"""
+    graph_ms: float
+    model_ms: float
+
+
+def steps(
+    simulator: Simulator,
+    trajectory: Trajectory,
+    policy: Policy,
+    count: int,
+    *,
+    radius: float | None = None,
+    teacher_forcing: bool = False,
+) -> Iterator[Step]:
+    """The ``count`` steps that follow the first ``HISTORY`` frames of ``trajectory``.
+
+    ``radius`` changes the graph only: features stay divided by the radius the model was trained
+    with. With ``teacher_forcing`` every step starts from the true positions.
+    """
+    frames = len(trajectory.positions)
+    if not 0 < count <= frames - HISTORY:
+        raise ValueError(
+            f"count: {trajectory.name} has {frames} frames, so 1 to {frames - HISTORY} steps can "
+            f"follow the first {HISTORY}; got {count}"
+        )
+    device = simulator.lower.device
+    true = torch.from_numpy(trajectory.positions).to(device)  # [T, N, d]
+    particle_type = torch.from_numpy(trajectory.particle_type).to(device)
+    material = trajectory.material_property
+    material = None if material is None else torch.from_numpy(material).to(device)
+    mobile = ~np.isin(trajectory.particle_type, simulator.metadata.kinematic_types)
+    kinematic = torch.from_numpy(~mobile).to(device)
+    window = true[:HISTORY].transpose(0, 1).contiguous()  # [N, H, d]
+    sigma: NDArray[np.float32] | None = None
+
+    def predict(edges: Edges | None) -> Prediction:
+        graph = None
+        if edges is not None:
+            graph = Graph.from_numpy(*edges).to(device)
+        with torch.inference_mode():
+            return simulator(window, particle_type, graph, material)  # type: ignore[no-any-return]
+
+    def predict_sigma(edges: Edges) -> NDArray[np.float32]:
+        return to_sigma(predict(edges))
+
+    for index in range(HISTORY, HISTORY + count):
+        started = time.perf_counter()
+        edges = None
+        if simulator.config.edges:
+            state = State(
+                positions=window[:, -1].cpu().numpy(),
+                sigma=sigma,
+                mobile=mobile,
+                radius=simulator.radius if radius is None else radius,
+                self_edges=simulator.config.self_edges,
+                box=simulator.metadata.box,
+                predict_sigma=predict_sigma,
+            )
+            edges = policy.edges(state)
+        built = time.perf_counter()
+        prediction = predict(edges)
+        following = simulator.advance(window, prediction.acceleration)
+        following = torch.where(kinematic[:, None], true[index], following)
+        positions = following.cpu().numpy()
+        finished = time.perf_counter()
+        error = prediction.acceleration - simulator.target(window, true[index])
+        if prediction.variance is not None:
+            sigma = prediction.variance.sqrt().cpu().numpy()
+        yield Step(
+            positions=positions,
+            sigma=sigma,
+            squared_error=error.square().sum(1).cpu().numpy(),
+            edges=0 if edges is None else directed_edges(edges, simulator.config.self_edges),
+            graph_ms=1e3 * (built - started),
+            model_ms=1e3 * (finished - built),
+        )
+        newest = true[index] if teacher_forcing else following
+        window = torch.cat([window[:, 1:], newest[:, None]], dim=1)
+
+
+def to_sigma(prediction: Prediction) -> NDArray[np.float32]:
+    """``[N]`` standard deviations in normalized units."""
+    if prediction.variance is None:
+        raise ValueError(
+            "policy: it needs the model's variance, and this model was trained with the loss mse, "
+            "which has none; accepted policies are fixed and knn"
+        )
+    sigma: NDArray[np.float32] = prediction.variance.sqrt().cpu().numpy()
+    return sigma
+
+
+def directed_edges(edges: Edges, self_edges: bool) -> int:
+    """Number of directed edges between different particles."""
+    index, offsets = edges
+    return index.shape[1] - (len(offsets) - 1) * self_edges
+
+
+def write_rollouts(config: RolloutConfig, console: Console) -> None:
+    """Roll out the trajectories that ``config`` asks for, and write them to ``config.out``."""
+    checkpoint = read_checkpoint(config.checkpoint)
+    simulator = checkpoint.simulator().to(torch_device(config.device))
+    folder = dataset_folder(config.data or checkpoint.config.data)
+    split = open_split(folder, config.split)
+    count = len(split) if config.trajectories is None else min(config.trajectories, len(split))
+    network = "GNS" if simulator.config.edges else "MLP"
+    settings = {
+        **to_json(config),
+        "label": f"{network} {checkpoint.config.loss}",
+        "trained_radius": simulator.radius,
+        "training": to_json(checkpoint.config),
+        "training_steps": checkpoint.step,
+    }
+    with (
+        RolloutWriter(config.out, metadata=simulator.metadata, settings=settings) as writer,
+        Progress(console=console, transient=True) as progress,
+    ):
+        for index in progress.track(range(count), description=f"{config.policy} rollouts"):
+            trajectory = split[index]
+            frames = len(trajectory.positions) - HISTORY
+            horizon = frames if config.steps is None else min(config.steps, frames)
+
+            def roll(teacher_forcing: bool) -> Iterator[Step]:
+                policy = make_policy(
+                    config.policy, config.adaptive, k=config.k, seed=config.seed + index
+                )
+                return steps(
+                    simulator,
+                    trajectory,
+                    policy,
+                    horizon,
+                    radius=config.radius,
+                    teacher_forcing=teacher_forcing,
+                )
+
+            one_step = islice(enumerate(roll(True), start=HISTORY), 0, None, config.one_step_every)
+            writer.add(trajectory, roll(False), one_step)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command with ``argv``, or with the process's own arguments."""
+    config = tyro.cli(RolloutConfig, args=argv, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+    console = Console()
+    try:
+        write_rollouts(config, console)
+    except (ValueError, OSError) as error:
+        console.print(f"error: {error}", markup=False, style="red")
+        raise SystemExit(2) from None
+    console.print(f"{config.out}", highlight=False)
+
+
+if __name__ == "__main__":
+    main()

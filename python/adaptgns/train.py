@@ -1,0 +1,159 @@
+"""`python -m adaptgns.train`: data, training, rollouts, and the table of what came out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+import tyro
+from rich.console import Console
+
+from adaptgns.atomic import written_whole
+from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint
+from adaptgns.config import PolicyName, RolloutConfig, TrainConfig, from_json, to_json
+from adaptgns.data.default import dataset_folder
+from adaptgns.data.metadata import read_metadata
+from adaptgns.data.trajectories import open_split
+from adaptgns.evaluate import evaluate
+from adaptgns.fit import Trainer, TrainingStopped
+from adaptgns.plot import animate
+from adaptgns.presets import PRESETS
+from adaptgns.rollout import write_rollouts
+
+CONFIG = "config.json"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command with ``argv``, or with the process's own arguments."""
+    console = Console()
+    try:
+        config = parse(sys.argv[1:] if argv is None else list(argv))
+        train(config, console)
+    except TrainingStopped as stopped:
+        console.print(str(stopped), markup=False)
+        raise SystemExit(1) from None
+    except (ValueError, OSError) as error:
+        console.print(f"error: {error}", markup=False, style="red")
+        raise SystemExit(2) from None
+
+
+def parse(arguments: list[str]) -> TrainConfig:
+    """The configuration of a run: that of a preset, of a file (``--config FILE.json``) or of the
+    run that is resumed, changed by the other arguments."""
+    preset, arguments = _take(arguments, "--preset")
+    source, arguments = _take(arguments, "--config")
+    resume, arguments = _take(arguments, "--resume")
+    if preset is not None and preset not in PRESETS:
+        raise ValueError(f"--preset: got {preset!r}; accepted are {', '.join(PRESETS)}")
+    default = PRESETS[preset or "laptop"]  # type: ignore[index]
+    if resume is not None:
+        folder = Path(resume)
+        default = replace(read_checkpoint(folder / LAST).config, resume=folder, out=folder)
+    elif source is not None:
+        default = from_json(TrainConfig, json.loads(Path(source).read_text()), source=source)
+    return tyro.cli(
+        TrainConfig,
+        default=default,
+        args=arguments,
+        description=f"{__doc__}\n\n--config FILE.json starts from the configuration that a run "
+        "saved, --resume DIR from that of the run it goes on with; other options change it.",
+    )
+
+
+def _take(arguments: list[str], option: str) -> tuple[str | None, list[str]]:
+    """The value of ``option`` (as ``--option value`` or ``--option=value``) and the other
+    arguments."""
+    for index, argument in enumerate(arguments):
+        if argument == option and index + 1 < len(arguments):
+            return arguments[index + 1], arguments[:index] + arguments[index + 2 :]
+        if argument.startswith(option + "="):
+            return argument.split("=", 1)[1], arguments[:index] + arguments[index + 1 :]
+    return None, arguments
+
+
+def train(config: TrainConfig, console: Console) -> Path:
+    """Train by ``config`` and report on the test split; the run folder."""
+    folder = run_folder(config)
+    checkpoint = None if config.resume is None else read_checkpoint(config.resume / LAST)
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    data = dataset_folder(config.data)
+    metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
+    folder.mkdir(parents=True, exist_ok=True)
+    with written_whole(folder / CONFIG) as partial:
+        partial.write_text(json.dumps(to_json(config), indent=1))
+    trainer = Trainer(
+        config, metadata, folder, open_split(data, "train"), open_split(data, "valid"), checkpoint
+    )
+    console.print(
+        f"training on {data}: {len(trainer.windows):,} windows, "
+        f"{sum(p.numel() for p in trainer.simulator.parameters()):,} parameters, "
+        f"{trainer.device.type}; run folder {folder}",
+        highlight=False,
+    )
+    trainer.run(console)
+    report(folder, data, config, console)
+    return folder
+
+
+def run_folder(config: TrainConfig) -> Path:
+    """Where the run's files go. A new run never goes where another one is."""
+    if config.resume is not None:
+        return config.resume
+    if config.out is not None:
+        if (config.out / LAST).exists():
+            raise ValueError(
+                f"--out: {config.out} holds a run already; go on with it (--resume {config.out}) "
+                "or name another folder"
+            )
+        return config.out
+    network = "gns" if config.model.edges else "mlp"
+    name = f"{Path(config.data).name}-{config.preset}-{network}-{config.loss}-{config.seed}"
+    folder = Path("runs") / name
+    taken = 1
+    while (folder / LAST).exists():
+        taken += 1
+        folder = Path("runs") / f"{name}-{taken}"
+    return folder
+
+
+def report(folder: Path, data: Path, config: TrainConfig, console: Console) -> None:
+    """Roll the test split out, fixed and adaptive; print the table and where everything is."""
+    policies: list[PolicyName] = ["fixed"]
+    if config.model.edges and config.loss != "mse":
+        policies.append("adaptive")
+    files = []
+    for policy in policies:
+        out = folder / "rollouts" / f"{policy}.h5"
+        write_rollouts(
+            RolloutConfig(
+                checkpoint=folder,
+                data=str(data),
+                policy=policy,
+                adaptive=config.adaptive,
+                steps=config.test_horizon,
+                trajectories=config.test_trajectories,
+                out=out,
+            ),
+            console,
+        )
+        files.append(out)
+    evaluate(files, out=folder, console=console)
+    animation = folder / "rollout.gif"
+    animate(files[-1], animation)
+    console.print(
+        f"checkpoint  {checkpoint_file(folder)}\n"
+        f"metrics     {folder / 'metrics.json'}\n"
+        f"rollouts    {', '.join(map(str, files))}\n"
+        f"animation   {animation}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""Training samples: windows of a trajectory, noised, batched, with their graph.
+
+A window is H input positions and the position that follows them. Everything random in a sample
+(order, noise, reflection) follows from the seed, the epoch and the sample's number, so a run
+depends neither on the number of loading workers nor on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from adaptgns._core import radius_graph
+from adaptgns.config import HISTORY, TrainConfig
+from adaptgns.data.metadata import Metadata
+from adaptgns.data.trajectories import Trajectories
+from adaptgns.noise import random_walk_noise
+from adaptgns.segment import Graph
+
+Key = tuple[int, int]
+"""(epoch, number of the window in the data set)"""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One window. ``positions`` float32 ``[F, N, d]``: noisy inputs, then the following position;
+    F is H + 1, or H + 2 with the extra frame in front that a lagged variance needs."""
+
+    positions: NDArray[np.float32]
+    particle_type: NDArray[np.int64]
+    material: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Several samples as one graph of N particles with no edges between samples."""
+
+    frames: Tensor
+    """float32 ``[N, F, d]``, the samples' positions"""
+    particle_type: Tensor
+    """int64 ``[N]``"""
+    material: Tensor | None
+    """float32 ``[N, P]``"""
+    mobile: Tensor
+    """bool ``[N]``, the non-kinematic particles"""
+    ptr: Tensor
+    """int64 ``[B + 1]``, offsets of the samples"""
+    graph: Graph | None
+    """The base graph of the last input positions; None for a model without edges"""
+
+    @property
+    def window(self) -> Tensor:
+        """The H input positions ``[N, H, d]``."""
+        return self.frames[:, -HISTORY - 1 : -1]
+
+    @property
+    def earlier_window(self) -> Tensor:
+        """The window one frame before, ``[N, H, d]``."""
+        return self.frames[:, -HISTORY - 2 : -2]
+
+    @property
+    def following(self) -> Tensor:
+        """The positions ``[N, d]`` to be predicted."""
+        return self.frames[:, -1]
+
+    def to(self, device: torch.device) -> Batch:
+        """The same batch on another device."""
+        moved = {
+            name: None if value is None else value.to(device, non_blocking=True)
+            for name, value in vars(self).items()
+        }
+        return Batch(**moved)
+
+    def pin_memory(self) -> Batch:
+        """The same batch in page-locked memory; torch's DataLoader calls this."""
+        return Batch(**{n: None if v is None else v.pin_memory() for n, v in vars(self).items()})
+
+
+class Windows(Dataset[Sample]):
+    """All windows of a split; indexed by :data:`Key`."""
+
+    def __init__(
+        self, trajectories: Trajectories, metadata: Metadata, config: TrainConfig, *, noise: float
+    ) -> None:
+        self.trajectories = trajectories
+        self.metadata = metadata
+        self.config = config
+        self.noise = noise
+        self.frames = HISTORY + 1 + (config.graph == "adaptive")
+        self.starts = np.concatenate(
+            [[0], np.cumsum(np.maximum(trajectories.lengths - self.frames + 1, 0))]
+        )
+
+    def __len__(self) -> int:
+        return int(self.starts[-1])
+
+    def __getitem__(self, key: Key) -> Sample:
+        epoch, number = key
+        rng = np.random.default_rng([self.config.seed, epoch, number])
+        trajectory = int(np.searchsorted(self.starts, number, side="right")) - 1
+        start = int(number - self.starts[trajectory])
+        window = self.trajectories.window(trajectory, start, start + self.frames)
+        positions = np.array(window.positions)
+        mobile = self.mobile(window.particle_type)
+        if self.config.mirror and rng.random() < 0.5:
+            positions[..., 0] = np.float32(sum(self.metadata.bounds[0])) - positions[..., 0]
+        std = self.noise * self.config.noise_spread ** rng.random()
+        if std > 0:
+            walk = random_walk_noise(rng, HISTORY, positions.shape[1], positions.shape[2], std)
+            walk *= mobile[:, None]
+            positions[-HISTORY - 1 : -1] += walk
+            # The following position moves along, so that the target undoes the noise of the last
+            # velocity and of that of the last position only the share asked for.
+            positions[-1] += walk[-1] * np.float32(1 - self.config.position_correction)
+        return Sample(positions, window.particle_type, window.material_property)
+
+    def mobile(self, particle_type: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which particles are not kinematic, bool ``[N]``."""
+        return ~np.isin(particle_type, self.metadata.kinematic_types)
+
+    def collate(self, samples: Sequence[Sample]) -> Batch:
+        """One batch with its base graph, built on the noisy positions."""
+        frames = np.concatenate([s.positions for s in samples], axis=1)
+        particle_type = np.concatenate([s.particle_type for s in samples])
+        ptr = np.cumsum([0, *(s.positions.shape[1] for s in samples)], dtype=np.int64)
+        materials = [s.material for s in samples if s.material is not None]
+        model = self.config.model
+        graph = None
+        if model.edges:
+            edges = radius_graph(
+                frames[-2],
+                model.radius if model.radius is not None else self.metadata.radius,
+                ptr=ptr,
+                box=self.metadata.box,
+                self_edges=model.self_edges,
+                return_offsets=True,
+            )
+            graph = Graph.from_numpy(*edges)
+        return Batch(
+            frames=torch.from_numpy(np.ascontiguousarray(frames.transpose(1, 0, 2))),
+            particle_type=torch.from_numpy(particle_type),
+            material=torch.from_numpy(np.concatenate(materials)) if materials else None,
+            mobile=torch.from_numpy(self.mobile(particle_type)),
+            ptr=torch.from_numpy(ptr),
+            graph=graph,
+        )
+
+
+class ShuffledKeys(Sampler[list[Key]]):
+    """The keys of each batch from step ``first`` to step ``last``: epoch after epoch, each a
+    permutation drawn from (seed, epoch). A batch may straddle two epochs; no window is left out."""
+
+    def __init__(self, windows: int, batch: int, seed: int, first: int, last: int) -> None:
+        self.windows, self.batch, self.seed = windows, batch, seed
+        self.first, self.last = first, last
+
+    def __len__(self) -> int:
+        return self.last - self.first
+
+    def __iter__(self) -> Iterator[list[Key]]:
+        drawn_epoch, order = -1, np.empty(0, dtype=np.int64)
+        for step in range(self.first, self.last):
+            keys = []
+            for position in range(step * self.batch, (step + 1) * self.batch):
+                epoch, place = divmod(position, self.windows)
+                if epoch != drawn_epoch:
+                    order = np.random.default_rng([self.seed, epoch]).permutation(self.windows)
+                    drawn_epoch = epoch
+                keys.append((epoch, int(order[place])))
+            yield keys
+
+
+def training_batches(windows: Windows, config: TrainConfig, first: int, *, pin: bool) -> DataLoader[Sample]:
+    """The batches of steps ``first`` to ``config.steps``, one :class:`Batch` each."""
+    return DataLoader(
+        windows,
+        batch_sampler=ShuffledKeys(len(windows), config.batch, config.seed, first, config.steps),
+        num_workers=config.workers,
+        collate_fn=windows.collate,
+        pin_memory=pin,
+    )

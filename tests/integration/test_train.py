@@ -1,0 +1,100 @@
+"""The main job from the command line: trained, killed, resumed, reported."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from adaptgns.checkpoint import LAST, read_checkpoint
+from adaptgns.train import main
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "adaptgns.train", *map(str, arguments)]
+
+
+def test_smoke_run_reports_everything(drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    main(["--preset", "smoke", "--data", str(drops), "--out", str(out)])
+    printed = capsys.readouterr().out
+    for name in ("best.safetensors", "metrics.json", "fixed.h5", "adaptive.h5", "rollout.gif"):
+        assert name in printed
+    assert "constant velocity" in printed
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics
+    assert json.loads((out / "config.json").read_text())["data"] == str(drops)
+
+    main(["--preset", "smoke", "--data", str(drops), "--out", str(tmp_path / "mlp"),
+          "--model.no-edges", "--steps", "3"])  # fmt: skip
+    assert "MLP" in capsys.readouterr().out
+
+
+def test_an_existing_run_is_not_overwritten(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / LAST).write_bytes(b"precious")
+    with pytest.raises(SystemExit) as exit_:
+        main(["--preset", "smoke", "--data", str(drops), "--out", str(tmp_path)])
+    assert exit_.value.code == 2
+    assert "holds a run already" in capsys.readouterr().out
+    assert (tmp_path / LAST).read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--preset", "huge"], "--preset: got 'huge'; accepted are smoke, laptop, paper"),
+        (["--data", "no/such/folder"], "no/such/folder"),
+        (["--resume", "no/such/run"], "not found"),
+    ],
+)
+def test_wrong_arguments_are_named(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+    assert message in capsys.readouterr().out
+
+
+def test_killed_ten_times_and_resumed_equals_uninterrupted(drops: Path, tmp_path: Path) -> None:
+    """kill -9 at random moments, the writing of a checkpoint included."""
+    options = ["--preset", "smoke", "--data", drops, "--steps", 300, "--checkpoint-every", 3,
+               "--validate-every", 50, "--threads", 1]  # fmt: skip
+    whole = subprocess.run(
+        command(*options, "--out", tmp_path / "whole"), capture_output=True, text=True, check=False
+    )
+    assert whole.returncode == 0, whole.stdout + whole.stderr
+
+    folder = tmp_path / "killed"
+    rng = random.Random(0)
+    last = folder / LAST
+    for kill in range(10):
+        resume = ["--resume", folder] if last.exists() else [*options, "--out", folder]
+        before = last.stat().st_mtime_ns if last.exists() else 0
+        process = subprocess.Popen(
+            command(*resume), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        # Some checkpoints later, at no particular moment.
+        while process.poll() is None and (not last.exists() or last.stat().st_mtime_ns == before):
+            time.sleep(0.002)
+        time.sleep(rng.uniform(0, 0.1))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert read_checkpoint(last).step < 300, f"finished before kill {kill}"
+    final = subprocess.run(command("--resume", folder), capture_output=True, text=True, check=False)
+    assert final.returncode == 0, final.stdout + final.stderr
+    assert "adaptive" in final.stdout
+
+    a, b = (read_checkpoint(tmp_path / f / LAST) for f in ("whole", "killed"))
+    assert a.step == b.step == 300
+    assert a.tensors.keys() == b.tensors.keys()
+    assert all(torch.equal(a.tensors[name], b.tensors[name]) for name in a.tensors)

@@ -1,0 +1,100 @@
+"""Checkpoints hold all that is needed, and are whole or absent."""
+
+from __future__ import annotations
+
+import errno
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from adaptgns.checkpoint import (
+    BEST,
+    LAST,
+    Checkpoint,
+    CheckpointError,
+    build_simulator,
+    read_checkpoint,
+    with_prefix,
+    write_checkpoint,
+)
+from adaptgns.config import ConfigError, TrainConfig, from_json, to_json
+from adaptgns.data.metadata import Metadata
+
+
+@pytest.fixture
+def checkpoint(small_config: TrainConfig, metadata: Metadata) -> Checkpoint:
+    simulator = build_simulator(small_config, metadata)
+    return Checkpoint(
+        small_config, metadata, 7, 0.5, with_prefix("model", simulator.state_dict())
+    )
+
+
+def test_round_trip(checkpoint: Checkpoint, tmp_path: Path) -> None:
+    write_checkpoint(tmp_path / LAST, checkpoint)
+    back = read_checkpoint(tmp_path)
+    assert (back.config, back.metadata, back.step, back.best_score) == (
+        checkpoint.config,
+        checkpoint.metadata,
+        7,
+        0.5,
+    )
+    ours, theirs = checkpoint.simulator().state_dict(), back.simulator().state_dict()
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[k], theirs[k]) for k in ours)
+
+
+def test_the_average_is_what_is_used(checkpoint: Checkpoint) -> None:
+    average = {k: v + 1 for k, v in checkpoint.group("model").items()}
+    averaged = replace(checkpoint, tensors=checkpoint.tensors | with_prefix("average", average))
+    used = averaged.simulator().state_dict()
+    assert all(torch.equal(used[k], average[k]) for k in used)
+
+
+def test_a_run_folder_means_its_best(checkpoint: Checkpoint, tmp_path: Path) -> None:
+    write_checkpoint(tmp_path / LAST, checkpoint)
+    write_checkpoint(tmp_path / BEST, replace(checkpoint, step=5))
+    assert read_checkpoint(tmp_path).step == 5
+    assert read_checkpoint(tmp_path / LAST).step == 7
+
+
+def test_missing_and_damaged_files_are_named(checkpoint: Checkpoint, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"nowhere: not found; accepted are"):
+        read_checkpoint(tmp_path / "nowhere")
+    path = tmp_path / LAST
+    write_checkpoint(path, checkpoint)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(CheckpointError, match=r"last\.safetensors: cannot be read"):
+        read_checkpoint(path)
+
+
+def test_a_full_disk_keeps_the_old_checkpoint(
+    checkpoint: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_checkpoint(tmp_path / LAST, checkpoint)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_checkpoint(tmp_path / LAST, replace(checkpoint, step=8))
+    assert read_checkpoint(tmp_path).step == 7
+    assert [p.name for p in tmp_path.iterdir()] == [LAST]
+
+
+def test_configuration_round_trip(small_config: TrainConfig) -> None:
+    config = replace(small_config, out=Path("a/b"))
+    assert from_json(TrainConfig, to_json(config), source="test") == config
+
+
+def test_unknown_keys_and_wrong_kinds_are_refused(small_config: TrainConfig) -> None:
+    values = to_json(small_config)
+    with pytest.raises(ConfigError, match="config\\.json.*learning_rate"):
+        from_json(TrainConfig, values | {"learning_rate": 1}, source="config.json")
+    with pytest.raises(ConfigError, match="latents"):
+        from_json(TrainConfig, values | {"model": {"latents": 3}}, source="x")
+    with pytest.raises(ConfigError, match="loss"):
+        from_json(TrainConfig, values | {"loss": "mae"}, source="x")

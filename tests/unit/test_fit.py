@@ -1,0 +1,179 @@
+"""The training loop: it learns, resumes to the bit, and loses nothing when it is stopped."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from adaptgns import fit
+from adaptgns.checkpoint import BEST, LAST, read_checkpoint
+from adaptgns.config import AdaptiveConfig, TrainConfig
+from adaptgns.data.metadata import read_metadata
+from adaptgns.data.trajectories import open_split
+from adaptgns.fit import Trainer, TrainingStopped
+from adaptgns.policies import Adaptive
+from adaptgns.rollout import steps
+
+QUIET = Console(quiet=True)
+
+
+def trainer(drops: Path, folder: Path, config: TrainConfig, *, resume: bool = False) -> Trainer:
+    folder.mkdir(exist_ok=True)
+    return Trainer(
+        config,
+        read_metadata(drops),
+        folder,
+        open_split(drops, "train"),
+        open_split(drops, "valid"),
+        read_checkpoint(folder / LAST) if resume else None,
+    )
+
+
+def log(folder: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("graph", ["base", "adaptive"])
+def test_one_batch_can_be_overfitted(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, graph: str
+) -> None:
+    config = replace(small_config, graph=graph, steps=400, lr=3e-3, noise=3e-4, loss="nll")
+    run = trainer(drops, tmp_path, config)
+    batch = run.windows.collate([run.windows[0, 10], run.windows[0, 40]])
+    losses = []
+    for run.step in range(300):
+        losses.append(float(run.train_step(batch)))
+    assert np.mean(losses[-10:]) < losses[0] - 1
+
+
+def test_resumed_equals_uninterrupted(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    config = replace(small_config, average=0.9, clip=1.0, mirror=True, warmup=3, noise_spread=2.0)
+    trainer(drops, tmp_path / "whole", config).run(QUIET)
+
+    run = trainer(drops, tmp_path / "parts", config)
+    for batch in list(fit.training_batches(run.windows, config, 0, pin=False))[:8]:
+        run.train_step(batch)
+        run.step += 1
+    run.save()
+    trainer(drops, tmp_path / "parts", config, resume=True).run(QUIET)
+
+    whole, parts = (read_checkpoint(tmp_path / f / LAST).tensors for f in ("whole", "parts"))
+    assert whole.keys() == parts.keys()
+    assert any(name.startswith("optimizer.") for name in whole)
+    for name, tensor in whole.items():
+        assert torch.equal(tensor, parts[name]), name
+
+
+def test_metrics_best_checkpoint_and_log_after_a_resume(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    trainer(drops, tmp_path, small_config).run(QUIET)
+    best = read_checkpoint(tmp_path / BEST)
+    assert best.step in (6, 12)
+    assert not best.group("optimizer")
+    scores = {e["step"]: e["valid_rollout_mse"] for e in log(tmp_path) if "valid_rollout_mse" in e}
+    assert list(scores) == [6, 12]
+    assert best.best_score == min(scores.values()) == scores[best.step]
+
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 99, "loss": 1}\n{"step": 100, "lo')
+    longer = replace(small_config, steps=14)
+    trainer(drops, tmp_path, longer, resume=True).run(QUIET)
+    assert [e["step"] for e in log(tmp_path)] == [6, 12, 12, 14, 14]
+    assert any((tmp_path / "tensorboard").iterdir())
+
+
+def test_a_loss_that_is_not_finite_stops_with_what_to_look_at(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = trainer(drops, tmp_path, small_config)
+    original, calls = fit.training_loss, []
+
+    def sometimes_nan(*args: object) -> torch.Tensor:
+        calls.append(None)
+        return original(*args) * (torch.nan if len(calls) == 10 else 1)
+
+    monkeypatch.setattr(fit, "training_loss", sometimes_nan)
+    with pytest.raises(TrainingStopped, match=r"loss became nan.*last good state.*--lr.*--clip"):
+        run.run(QUIET)
+    kept = read_checkpoint(tmp_path / LAST)
+    assert kept.step == 8
+    assert all(t.isfinite().all() for t in kept.tensors.values())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_save_and_say_how_to_go_on(
+    drops: Path,
+    tmp_path: Path,
+    small_config: TrainConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+) -> None:
+    run = trainer(drops, tmp_path, small_config)
+    original = run.train_step
+
+    def interrupted_step(batch: fit.Batch) -> torch.Tensor:
+        if run.step == 5:
+            os.kill(os.getpid(), number)
+        return original(batch)
+
+    monkeypatch.setattr(run, "train_step", interrupted_step)
+    with pytest.raises(TrainingStopped, match=rf"{number.name} after step 6.*\n.*--resume"):
+        run.run(QUIET)
+    assert read_checkpoint(tmp_path / LAST).step == 6
+
+
+def test_a_full_disk_keeps_the_last_checkpoint(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = trainer(drops, tmp_path, small_config)
+    original = os.fsync
+
+    def full_later(descriptor: int) -> None:
+        if run.step >= 8:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        original(descriptor)
+
+    monkeypatch.setattr(os, "fsync", full_later)
+    with pytest.raises(OSError, match="No space left"):
+        run.run(QUIET)
+    assert read_checkpoint(tmp_path / LAST).step == 4
+
+
+def test_learning_rate_schedules(drops: Path, tmp_path: Path, small_config: TrainConfig) -> None:
+    config = replace(small_config, steps=100, lr=1e-3, lr_final=1e-6, warmup=10)
+    run = trainer(drops, tmp_path, config)
+    rates = []
+    for run.step in range(101):
+        rates.append(run.learning_rate())
+    assert rates[0] == pytest.approx(1e-4)
+    assert max(rates) == rates[10] == pytest.approx(1e-3)
+    assert rates[100] == pytest.approx(1e-6)
+    run = trainer(drops, tmp_path, replace(config, schedule="exponential", warmup=0))
+    run.step = 5_000_000
+    assert run.learning_rate() == pytest.approx(1e-6 + (1e-3 - 1e-6) * 0.1)
+
+
+def test_the_lagged_training_graph_is_that_of_a_rollout(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    """On true positions, the graph of training is the second one of an adaptive rollout."""
+    rule = AdaptiveConfig(tau=60, factor=1.5)
+    config = replace(small_config, graph="adaptive", noise=0.0, adaptive=rule)
+    run = trainer(drops, tmp_path, config)
+    trajectory = open_split(drops, "train")[0]
+    rolled = list(steps(run.simulator.eval(), trajectory, Adaptive(rule), 2, teacher_forcing=True))
+    graph = run._lagged_graph(run.windows.collate([run.windows[0, 0]]))
+    assert len(graph.senders) - len(trajectory.particle_type) == rolled[1].edges
+    assert rolled[1].edges != rolled[0].edges

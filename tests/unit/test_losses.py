@@ -1,0 +1,54 @@
+"""Losses against torch's own."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from adaptgns.losses import training_loss
+from adaptgns.network import Prediction
+
+
+@pytest.fixture
+def case() -> tuple[Prediction, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    prediction = Prediction(
+        torch.randn(7, 3, generator=generator), torch.rand(7, generator=generator) + 0.1
+    )
+    mobile = torch.tensor([True, True, False, True, False, True, True])
+    return prediction, torch.randn(7, 3, generator=generator), mobile
+
+
+def test_nll_is_torchs_gaussian_nll_summed_over_dimensions(case) -> None:
+    prediction, target, mobile = case
+    variance = prediction.variance[:, None].expand(-1, 3)
+    reference = nn.GaussianNLLLoss(reduction="none")(prediction.acceleration, target, variance)
+    expected = reference.sum(1)[mobile].mean()
+    torch.testing.assert_close(training_loss("nll", prediction, target, mobile), expected)
+
+
+def test_mse_is_torchs_over_mobile_particles(case) -> None:
+    prediction, target, mobile = case
+    expected = nn.MSELoss()(prediction.acceleration[mobile], target[mobile])
+    torch.testing.assert_close(training_loss("mse", prediction, target, mobile), expected)
+
+
+def test_kinematic_particles_carry_no_gradient(case) -> None:
+    prediction, target, mobile = case
+    acceleration = prediction.acceleration.clone().requires_grad_()
+    training_loss("nll", Prediction(acceleration, prediction.variance), target, mobile).backward()
+    assert (acceleration.grad[~mobile] == 0).all()
+    assert (acceleration.grad[mobile] != 0).all()
+
+
+def test_nan_surfaces(case) -> None:
+    prediction, target, mobile = case
+    target[0] = torch.nan
+    assert training_loss("nll", prediction, target, mobile).isnan()
+
+
+def test_nll_without_variance_head_is_refused(case) -> None:
+    prediction, target, mobile = case
+    with pytest.raises(ValueError, match="nll needs a network with a variance head"):
+        training_loss("nll", Prediction(prediction.acceleration, None), target, mobile)

@@ -1,0 +1,123 @@
+"""Policies and stepping."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from adaptgns.config import AdaptiveConfig, ModelConfig, PolicyName
+from adaptgns.data.metadata import Metadata
+from adaptgns.data.trajectories import Trajectory, open_split
+from adaptgns.policies import Adaptive, Fixed, make_policy
+from adaptgns.rollout import steps
+from adaptgns.simulator import Simulator
+
+RULE = AdaptiveConfig(tau=70, factor=1.5)
+
+
+@pytest.fixture
+def simulator(metadata: Metadata) -> Simulator:
+    torch.manual_seed(0)
+    config = ModelConfig(latent=8, hidden_layers=1, steps=1)
+    return Simulator(config, metadata, noise=0.0, variance=True).eval()
+
+
+@pytest.fixture
+def trajectory(drops: Path) -> Trajectory:
+    return open_split(drops, "test")[0]
+
+
+def still(simulator: Simulator) -> Simulator:
+    """The simulator with a decoder that predicts an acceleration of zero."""
+    last = simulator.network.decoder[-1]
+    torch.nn.init.zeros_(last.weight)
+    with torch.no_grad():
+        last.bias.copy_(-simulator.acceleration_mean / simulator.acceleration_std)
+    return simulator
+
+
+def test_zero_acceleration_holds_the_velocity(simulator: Simulator, trajectory: Trajectory) -> None:
+    rolled = list(steps(still(simulator), trajectory, Fixed(), 3))
+    velocity = trajectory.positions[5] - trajectory.positions[4]
+    expected = trajectory.positions[5] + velocity * np.arange(1, 4)[:, None, None]
+    np.testing.assert_allclose([s.positions for s in rolled], expected, atol=1e-6)
+
+
+def test_error_is_that_of_the_acceleration(simulator: Simulator, trajectory: Trajectory) -> None:
+    (step,) = steps(still(simulator), trajectory, Fixed(), 1)
+    true = np.diff(trajectory.positions[4:7].astype(np.float64), n=2, axis=0)[0]
+    std = simulator.acceleration_std.numpy()
+    expected = ((true / std) ** 2).sum(1)
+    np.testing.assert_allclose(step.squared_error, expected, rtol=1e-2, atol=1e-6)
+
+
+def test_adaptive_lags_by_one_step(simulator: Simulator, trajectory: Trajectory) -> None:
+    fixed = list(steps(simulator, trajectory, Fixed(), 2, teacher_forcing=True))
+    adaptive = list(steps(simulator, trajectory, Adaptive(RULE), 2, teacher_forcing=True))
+    assert adaptive[0].edges == fixed[0].edges
+    assert adaptive[1].edges > fixed[1].edges
+
+
+def test_two_pass_expands_at_once(simulator: Simulator, trajectory: Trajectory) -> None:
+    two_pass = make_policy("two-pass", RULE, k=0, seed=0)
+    (fixed,) = steps(simulator, trajectory, Fixed(), 1)
+    (both,) = steps(simulator, trajectory, two_pass, 1)
+    assert both.edges > fixed.edges
+
+
+def test_random_is_seeded(simulator: Simulator, trajectory: Trajectory) -> None:
+    def edges(seed: int) -> list[int]:
+        policy = make_policy("random", RULE, k=0, seed=seed)
+        return [s.edges for s in steps(simulator, trajectory, policy, 8, teacher_forcing=True)]
+
+    assert edges(1) == edges(1) != edges(2)
+
+
+def test_knn_has_k_senders_each(simulator: Simulator, trajectory: Trajectory) -> None:
+    (step,) = steps(simulator, trajectory, make_policy("knn", RULE, k=4, seed=0), 1)
+    assert step.edges == 4 * len(trajectory.particle_type)
+
+
+@pytest.mark.parametrize("name", ["adaptive", "two-pass", "random"])
+def test_every_policy_without_expansion_is_fixed(
+    simulator: Simulator, trajectory: Trajectory, name: PolicyName
+) -> None:
+    policy = make_policy(name, AdaptiveConfig(tau=70, factor=1.0), k=0, seed=0)
+    expected = [s.positions for s in steps(simulator, trajectory, Fixed(), 4)]
+    np.testing.assert_array_equal(
+        [s.positions for s in steps(simulator, trajectory, policy, 4)], expected
+    )
+
+
+def test_kinematic_particles_follow_their_trajectory(
+    simulator: Simulator, trajectory: Trajectory
+) -> None:
+    types = trajectory.particle_type.copy()
+    types[::3] = 3
+    rolled = list(steps(simulator, replace(trajectory, particle_type=types), Fixed(), 5))
+    predicted = np.stack([s.positions for s in rolled])
+    np.testing.assert_array_equal(predicted[:, ::3], trajectory.positions[6:11, ::3])
+    assert not np.array_equal(predicted[:, 1::3], trajectory.positions[6:11, 1::3])
+
+
+def test_radius_changes_the_graph_alone(simulator: Simulator, trajectory: Trajectory) -> None:
+    (narrow,) = steps(simulator, trajectory, Fixed(), 1)
+    (wide,) = steps(simulator, trajectory, Fixed(), 1, radius=0.03)
+    assert wide.edges > 2 * narrow.edges
+    assert simulator.radius == 0.015
+
+
+def test_variance_is_needed_by_two_pass(metadata: Metadata, trajectory: Trajectory) -> None:
+    config = ModelConfig(latent=8, hidden_layers=1, steps=1)
+    without = Simulator(config, metadata, noise=0.0, variance=False).eval()
+    with pytest.raises(ValueError, match="needs the model's variance"):
+        list(steps(without, trajectory, make_policy("two-pass", RULE, k=0, seed=0), 1))
+
+
+def test_too_long_a_horizon_is_named(simulator: Simulator, trajectory: Trajectory) -> None:
+    with pytest.raises(ValueError, match=r"count: .* has 40 frames, so 1 to 34 steps.*got 35"):
+        list(steps(simulator, trajectory, Fixed(), 35))

@@ -1,0 +1,133 @@
+"""Training samples: order, noise, targets and graphs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from adaptgns.config import TrainConfig
+from adaptgns.data.metadata import Metadata, read_metadata
+from adaptgns.data.trajectories import open_split
+from adaptgns.simulator import Simulator
+from adaptgns.windows import Batch, ShuffledKeys, Windows, training_batches
+
+
+@pytest.fixture
+def windows(drops: Path, small_config: TrainConfig) -> Windows:
+    return Windows(open_split(drops, "train"), read_metadata(drops), small_config, noise=3e-4)
+
+
+def test_every_window_once_an_epoch_and_any_start_gives_the_same_order() -> None:
+    keys = list(ShuffledKeys(windows=7, batch=3, seed=1, first=0, last=7))
+    counts = Counter(key for batch in keys for key in batch)
+    assert counts == {(epoch, number): 1 for epoch in range(3) for number in range(7)}
+    assert list(ShuffledKeys(windows=7, batch=3, seed=1, first=4, last=7)) == keys[4:]
+    assert [n for _, n in sum(keys, [])][:7] != [n for _, n in sum(keys, [])][7:14]
+
+
+def test_samples_depend_on_seed_epoch_and_number_alone(windows: Windows) -> None:
+    assert np.array_equal(windows[0, 5].positions, windows[0, 5].positions)
+    assert not np.array_equal(windows[0, 5].positions, windows[1, 5].positions)
+    assert not np.array_equal(windows[0, 5].positions, windows[0, 6].positions)
+
+
+def test_noise_moves_the_following_position_with_the_last(windows: Windows) -> None:
+    noisy = windows[0, 5].positions
+    clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)[0, 5].positions
+    noise = noisy - clean
+    assert (noise[0] == 0).all()
+    assert np.abs(noise[1:]).min() > 0
+    np.testing.assert_allclose(noise[-1], noise[-2], atol=1e-7)
+
+
+def test_target_undoes_the_noise_of_the_last_velocity(windows: Windows) -> None:
+    simulator = Simulator(
+        windows.config.model, windows.metadata, noise=3e-4, variance=True
+    )
+    batch = windows.collate([windows[0, 5]])
+    advanced = simulator.advance(batch.window, simulator.target(batch.window, batch.following))
+    clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
+    after = clean.collate([clean[0, 5]])
+    noise = batch.window[:, -1] - after.window[:, -1]
+    torch.testing.assert_close(advanced - noise, after.following, rtol=0, atol=3e-7)
+
+
+def test_kinematic_particles_carry_no_noise(windows: Windows) -> None:
+    all_kinematic = replace(windows.metadata, kinematic_types=(5,))
+    still = Windows(windows.trajectories, all_kinematic, windows.config, noise=3e-4)
+    clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
+    assert np.array_equal(still[0, 5].positions, clean[0, 5].positions)
+    assert not still.collate([still[0, 5]]).mobile.any()
+
+
+def test_mirrored_samples_stay_in_the_box(windows: Windows) -> None:
+    config = replace(windows.config, mirror=True)
+    mirrored = Windows(windows.trajectories, windows.metadata, config, noise=0.0)
+    plain = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
+    changed = 0
+    for number in range(20):
+        a, b = mirrored[0, number].positions, plain[0, number].positions
+        np.testing.assert_array_equal(a[..., 1], b[..., 1])
+        if not np.array_equal(a, b):
+            np.testing.assert_allclose(a[..., 0] + b[..., 0], 1.0, atol=1e-6)
+            changed += 1
+    assert 3 <= changed <= 17
+
+
+def test_batches_join_unequal_samples_without_edges_between(windows: Windows) -> None:
+    lengths = windows.starts
+    batch = windows.collate([windows[0, 0], windows[0, int(lengths[1])]])
+    first = windows[0, 0].positions.shape[1]
+    assert batch.ptr.tolist() == [0, first, len(batch.particle_type)]
+    assert batch.graph is not None
+    assert ((batch.graph.senders < first) == (batch.graph.receivers < first)).all()
+    distance = (batch.window[batch.graph.senders, -1] - batch.window[batch.graph.receivers, -1]).norm(dim=1)
+    assert distance.max() <= windows.metadata.radius * (1 + 1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+def test_number_of_workers_changes_nothing(windows: Windows) -> None:
+    def frames(workers: int) -> list[torch.Tensor]:
+        config = replace(windows.config, workers=workers, steps=5)
+        return [batch.frames for batch in training_batches(windows, config, 0, pin=False)]
+
+    alone, shared = frames(0), frames(2)
+    assert len(alone) == 5
+    for a, b in zip(alone, shared, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_adaptive_training_reads_one_frame_more(windows: Windows) -> None:
+    config = replace(windows.config, graph="adaptive")
+    longer = Windows(windows.trajectories, windows.metadata, config, noise=0.0)
+    batch: Batch = longer.collate([longer[0, 3]])
+    assert batch.frames.shape[1] == 8
+    assert torch.equal(batch.earlier_window[:, 1:], batch.window[:, :-1])
+    assert len(longer) == len(windows) - len(windows.trajectories)
+
+
+def test_noise_spreads_over_its_range(windows: Windows) -> None:
+    config = replace(windows.config, noise_spread=4.0)
+    varied = Windows(windows.trajectories, windows.metadata, config, noise=3e-4)
+    clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
+    stds = []
+    for number in range(60):
+        noise = varied[0, number].positions - clean[0, number].positions
+        stds.append(np.diff(noise[:6], axis=0)[-1].std())
+    assert 2e-4 < min(stds) < 5e-4
+    assert 9e-4 < max(stds) < 1.8e-3
+
+
+def test_position_correction_undoes_its_share(windows: Windows) -> None:
+    config = replace(windows.config, position_correction=0.25)
+    corrected = Windows(windows.trajectories, windows.metadata, config, noise=3e-4)[0, 5].positions
+    plain = windows[0, 5].positions
+    clean = Windows(windows.trajectories, windows.metadata, config, noise=0.0)[0, 5].positions
+    np.testing.assert_array_equal(corrected[:-1], plain[:-1])
+    noise = plain[-2] - clean[-2]
+    np.testing.assert_allclose(corrected[-1] - clean[-1], 0.75 * noise, atol=1e-7)
