@@ -46,14 +46,23 @@ class StoreWriter:
         Args:
             path: where the finished file goes; replaced if it exists.
             origin: what made the data, to be read back by `read_origin`.
+
+        Raises:
+            DataError: another process is writing the same file.
+            OSError: the folder can't be written, or the disk is full.
         """
         self.path = Path(path)
         self._partial = partial_path(self.path)
         self._written = 0
+        _remove_abandoned(self._partial)
         try:
-            self._file = h5py.File(self._partial, "w")
-        except OSError as error:
-            raise DataError(f"{self._partial}: can't be created: {error}") from error
+            # Not "w", which would empty the file of another process before finding it locked.
+            self._file = h5py.File(self._partial, "x")
+        except FileExistsError as error:
+            raise DataError(f"{self._partial}: another process is writing it") from error
+        except OSError:
+            self._partial.unlink(missing_ok=True)
+            raise
         if origin is not None:
             self._file.attrs[_ORIGIN] = origin
 
@@ -96,6 +105,19 @@ class StoreWriter:
                 self._file.close()
         finally:
             self._partial.unlink(missing_ok=True)
+
+
+def _remove_abandoned(partial: Path) -> None:
+    """Removes what a killed process left, unless the process lives and holds HDF5's lock."""
+    if not partial.exists():
+        return
+    try:
+        h5py.File(partial, "r+").close()
+    except BlockingIOError as error:
+        raise DataError(f"{partial}: another process is writing it") from error
+    except OSError:
+        pass  # no whole HDF5 file, as is to be expected
+    partial.unlink()
 
 
 def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
