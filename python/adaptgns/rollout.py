@@ -17,7 +17,7 @@ from rich.progress import Progress
 from adaptgns.checkpoint import read_checkpoint
 from adaptgns.config import HISTORY, RolloutConfig, to_json, torch_device
 from adaptgns.data.trajectories import Trajectory, open_split
-from adaptgns.generate import dataset_folder
+from adaptgns.data.default import dataset_folder
 from adaptgns.network import Prediction
 from adaptgns.policies import Edges, Policy, State, make_policy
 from adaptgns.rollout_file import RolloutWriter

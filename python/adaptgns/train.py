@@ -15,11 +15,11 @@ from rich.console import Console
 from adaptgns.atomic import written_whole
 from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint
 from adaptgns.config import PolicyName, RolloutConfig, TrainConfig, from_json, to_json
+from adaptgns.data.default import dataset_folder
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.evaluate import evaluate
 from adaptgns.fit import Trainer, TrainingStopped
-from adaptgns.generate import EMBEDDED, default_dataset
 from adaptgns.plot import animate
 from adaptgns.presets import PRESETS
 from adaptgns.rollout import write_rollouts
@@ -81,7 +81,7 @@ def train(config: TrainConfig, console: Console) -> Path:
     checkpoint = None if config.resume is None else read_checkpoint(config.resume / LAST)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    data = default_dataset(config.data) if config.data in EMBEDDED else Path(config.data)
+    data = dataset_folder(config.data)
     metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
     folder.mkdir(parents=True, exist_ok=True)
     with written_whole(folder / CONFIG) as partial:
