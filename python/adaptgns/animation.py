@@ -79,8 +79,10 @@ class Animation:
         self._moving: list[Artist] = []
         self._build_panels(rollout)
         self._build_strips(rollout)
-        self._canvas.draw()
-        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+        self._canvas.draw()  # type: ignore[no-untyped-call]
+        self._background = self._canvas.copy_from_bbox(  # type: ignore[no-untyped-call]
+            self._figure.bbox
+        )
 
     def write(self, path: Path, fps: int) -> None:
         """Write the GIF ``path``, whole or not at all."""
@@ -108,7 +110,8 @@ class Animation:
             self._canvas.restore_region(self._background)  # type: ignore[no-untyped-call]
             for artist in self._moving:
                 self._figure.draw_artist(artist)
-            yield np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+            drawn = np.asarray(self._canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+            yield drawn[..., :3].copy()
 
     def _palette(self) -> Image.Image:
         """One palette for all pictures: of a few of them spread over the animation, and of the
@@ -137,7 +140,15 @@ class Animation:
         area = self._marker_area(truth)
 
         def cloud(axes: Axes, colours: Floats, colour_map: Colormap, scale: Normalize) -> Cloud:
-            return Cloud(axes, self._view, colours, self._mobile, colour_map, scale, area)
+            return Cloud(
+                axes,
+                view=self._view,
+                colours=colours,
+                mobile=self._mobile,
+                colour_map=colour_map,
+                scale=scale,
+                area=area,
+            )
 
         self._true_cloud = cloud(truth, speeds, SPEED_MAP, speed)
         if self._sigma is None:
@@ -251,7 +262,7 @@ class Animation:
         left, width = panel.get_position().x0, panel.get_position().width
         axes = self._figure.add_axes((left + 0.42 * width, 0.252, 0.56 * width, 0.011))
         bar = self._figure.colorbar(points, cax=axes, orientation="horizontal")
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        bar.outline.set_visible(False)
         axes.tick_params(colors=TEXT, labelsize=SMALL, length=2, pad=2)
         if isinstance(points.norm, LogNorm):
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -280,6 +291,7 @@ class Cloud:
     def __init__(
         self,
         axes: Axes,
+        *,
         view: View,
         colours: Floats,
         mobile: NDArray[np.bool_],

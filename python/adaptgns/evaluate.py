@@ -1,7 +1,7 @@
 """`python -m adaptgns.evaluate`: measure rollouts against the truth and each other.
 
 Writes metrics.json and prints a table with a row for each rollout file, and for two baselines on
-the same trajectories. The measures are defined in :mod:`adaptgns.metrics`.
+the same trajectories. The measures are defined in adaptgns.metrics.
 """
 
 from __future__ import annotations
@@ -92,13 +92,13 @@ def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
         baselines: dict[str, Tally] = defaultdict(Tally)
         for rollouts in zip(*opened, strict=True):
             truth = Truth.of(max(rollouts, key=lambda rollout: rollout.steps), first)
-            truth_statistics.append(truth.statistics(truth.positions, statistics_step))
+            truth_statistics += truth.statistics(truth.positions, statistics_step)
             for tally, rollout in zip(tallies, rollouts, strict=True):
                 predicted = rollout.predicted
                 tally.add_positions(truth, predicted, marks)
                 tally.add_graph(rollout)
                 tally.add_one_step(rollout, truth)
-                tally.statistics.append(truth.statistics(predicted, statistics_step))
+                tally.statistics += truth.statistics(predicted, statistics_step)
             for name, predicted in baseline_predictions(truth):
                 baselines[name].add_positions(truth, predicted, marks)
         measures = [
@@ -112,7 +112,11 @@ def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
             baselines=[tally.measures(name, "") for name, tally in baselines.items()],
             statistics_step=statistics_step,
             true_statistics=truth_statistics,
-            notes=[*short_notes(measures, marks), *unit_notes(opened)],
+            notes=[
+                *short_notes(measures, marks),
+                *divergence_notes(measures, names),
+                *unit_notes(opened),
+            ],
         )
 
 
@@ -142,9 +146,13 @@ class Truth:
         course = np.concatenate([self.initial[-1:], positions])
         return kinetic_energy(course, self.mobile, self.metadata.dt, self.metadata.box)
 
-    def statistics(self, positions: Floats, step: int) -> GraphStatistics:
-        """Of the radius graph on ``positions`` ``[K, N, d]`` after ``step`` steps."""
-        return graph_statistics(positions[step - 1], self.metadata.radius, self.metadata.box)
+    def statistics(self, positions: Floats, step: int) -> list[GraphStatistics]:
+        """Of the radius graph on ``positions`` ``[K, N, d]`` after ``step`` steps; none where they
+        are not finite."""
+        frame = positions[step - 1]
+        if not np.isfinite(frame).all():
+            return []
+        return [graph_statistics(frame, self.metadata.radius, self.metadata.box)]
 
 
 @dataclass
@@ -226,7 +234,7 @@ class Tally:
             calibration=calibration(variance, error, self.dim, DECILES)
             if len(error) >= DECILES
             else None,
-            statistics=self.statistics,
+            statistics=self.statistics if len(self.statistics) == count else (),
             settings={} if file is None else file.settings,
             file=None if file is None else str(file.path),
         )
@@ -298,6 +306,21 @@ def short_notes(measures: Sequence[Measures], marks: Sequence[int]) -> list[str]
         f"{row.horizon} steps"
         for row in measures
         if (missed := [mark for mark in marks if mark > row.horizon])
+    ]
+
+
+def divergence_notes(measures: Sequence[Measures], names: Sequence[str]) -> list[str]:
+    """Which rollouts ended in positions that are not finite."""
+    return [
+        f"{row.name} diverged in trajectory {', '.join(diverged)}"
+        for row in measures
+        if (
+            diverged := [
+                name
+                for name, mse in zip(names, row.scalars["mse"], strict=True)
+                if not np.isfinite(mse)
+            ]
+        )
     ]
 
 

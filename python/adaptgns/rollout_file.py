@@ -28,11 +28,12 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from adaptgns.atomic import written_whole
 from adaptgns.data.metadata import Metadata
+from adaptgns.data.trajectory import INPUT_FRAMES, Trajectory
 
 FORMAT = "adaptgns-rollout"
 VERSION = 1
-HISTORY = 6
-"""Frames that a rollout starts from"""
+CHUNK_BYTES = 1 << 18
+"""About the size of the pieces in which a tensor grows"""
 
 
 @dataclass(frozen=True)
@@ -91,22 +92,6 @@ class StepRecord(Protocol):
         """Milliseconds that the network and the integration took"""
 
 
-class TrajectoryRecord(Protocol):
-    """The trajectory that is predicted."""
-
-    @property
-    def name(self) -> str:
-        """Its name in the data set"""
-
-    @property
-    def positions(self) -> NDArray[np.float32]:
-        """``[T, N, d]``"""
-
-    @property
-    def particle_type(self) -> NDArray[np.int64]:
-        """``[N]``"""
-
-
 class RolloutWriter:
     """Writes a rollout file trajectory by trajectory; use it in a ``with`` statement.
 
@@ -143,7 +128,7 @@ class RolloutWriter:
 
     def add(
         self,
-        trajectory: TrajectoryRecord,
+        trajectory: Trajectory,
         steps: Iterable[StepRecord],
         one_step: Iterable[tuple[int, StepRecord]] = (),
     ) -> None:
@@ -154,7 +139,7 @@ class RolloutWriter:
         """
         group = self._file.create_group(f"{self._count:05d}")
         group.attrs["name"] = trajectory.name
-        _create(group, "initial", trajectory.positions[:HISTORY])
+        _create(group, "initial", trajectory.positions[:INPUT_FRAMES])
         _create(group, "particle_type", trajectory.particle_type)
         count = 0
         for step in steps:
@@ -169,7 +154,7 @@ class RolloutWriter:
             raise ValueError(
                 f"steps: got none for trajectory {trajectory.name}; expected 1 or more"
             )
-        _create(group, "true", trajectory.positions[HISTORY : HISTORY + count])
+        _create(group, "true", trajectory.positions[INPUT_FRAMES : INPUT_FRAMES + count])
         for frame, step in one_step:
             _append(group, "one_step/frame", frame)
             _append(group, "one_step/squared_error", step.squared_error)
@@ -348,9 +333,6 @@ class RolloutFile:
         return ~np.isin(particle_type, self.metadata.kinematic_types)
 
 
-CHUNK_BYTES = 1 << 18
-
-
 def _create(group: h5py.Group, name: str, values: ArrayLike) -> None:
     tensor = CATALOGUE[name]
     dataset = group.create_dataset(name, data=np.asarray(values, dtype=tensor.dtype))
@@ -382,7 +364,7 @@ def _append(group: h5py.Group, name: str, row: ArrayLike) -> None:
 def _check(group: h5py.Group) -> None:
     """Raise ValueError unless the tensors of ``group`` have the catalogue's shapes, one size a
     letter."""
-    sizes: dict[str, tuple[int, str]] = {"H": (HISTORY, "the history")}
+    sizes: dict[str, tuple[int, str]] = {"H": (INPUT_FRAMES, "the input")}
     for name, tensor in CATALOGUE.items():
         if name not in group:
             continue

@@ -1,0 +1,152 @@
+"""The animation shows what it should."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from adaptgns.animation import Animation
+from adaptgns.data.metadata import Metadata
+from adaptgns.plot import animate, main
+from adaptgns.rollout_file import RolloutFile
+from adaptgns.view import View
+from tests.unit.rollouts import write_rollout
+
+
+@pytest.fixture
+def adaptive(tmp_path: Path, metadata: Metadata) -> Path:
+    rule = {"tau": 70.0, "factor": 3.0}
+    return write_rollout(tmp_path / "a.h5", metadata, policy="adaptive", adaptive=rule)
+
+
+def picture(path: Path, row: int = 6) -> np.ndarray:
+    with RolloutFile(path) as file:
+        return next(Animation(file, file[0], every=1).pictures([row])).astype(int)
+
+
+def panel(image: np.ndarray, right: bool) -> np.ndarray:
+    """The inside of one of the two panels of particles."""
+    height, width = image.shape[:2]
+    half = width // 2
+    return image[height // 10 : 7 * height // 10, half * right : half * (1 + right)]
+
+
+def colours(image: np.ndarray) -> set[tuple[int, ...]]:
+    return {tuple(colour) for colour in np.unique(image.reshape(-1, 3), axis=0)}
+
+
+def test_gif_has_every_nth_step_and_the_last(tmp_path: Path, adaptive: Path) -> None:
+    animate(adaptive, tmp_path / "new" / "a.gif", every=5, fps=20)
+    with Image.open(tmp_path / "new" / "a.gif") as gif:
+        # Of 12 steps: 5, 10 and 12.
+        assert (gif.n_frames, gif.info["duration"], gif.info["loop"]) == (3, 50, 0)
+        frames = []
+        for index in range(gif.n_frames):
+            gif.seek(index)
+            frames.append(np.asarray(gif.convert("RGB")))
+    assert all(len(colours(panel(frame, right))) > 20 for frame in frames for right in (0, 1))
+    assert not np.array_equal(panel(frames[0], False), panel(frames[2], False))
+    assert not np.array_equal(panel(frames[0], True), panel(frames[2], True))
+
+
+def test_sigma_colours_the_prediction_alone(tmp_path: Path, metadata: Metadata) -> None:
+    path = write_rollout(tmp_path / "a.h5", metadata)
+    before = picture(path)
+    with h5py.File(path, "r+") as file:
+        file["00000/sigma"][6] = file["00000/sigma"][6][::-1]
+    after = picture(path)
+    np.testing.assert_array_equal(panel(after, False), panel(before, False))
+    assert not np.array_equal(panel(after, True), panel(before, True))
+
+
+def test_without_sigma_both_sides_show_the_speed(tmp_path: Path, metadata: Metadata) -> None:
+    path = write_rollout(tmp_path / "a.h5", metadata, sigma=False, error=0.0)
+    image = picture(path)
+    assert colours(panel(image, False)) & colours(panel(image, True)) > {(10, 13, 19)}
+
+
+def test_extra_edges_are_drawn_for_the_adaptive_policy(
+    tmp_path: Path, metadata: Metadata, adaptive: Path
+) -> None:
+    def green_pixels(path: Path) -> int:
+        red, green, blue = np.moveaxis(panel(picture(path), True), -1, 0)
+        return int(((green > red + 50) & (green > blue + 10)).sum())
+
+    fixed = write_rollout(tmp_path / "f.h5", metadata, policy="fixed")
+    assert green_pixels(adaptive) > 20
+    assert green_pixels(fixed) == 0
+
+
+def test_particles_are_where_they_are(tmp_path: Path, metadata: Metadata) -> None:
+    path = write_rollout(tmp_path / "a.h5", metadata)
+    with h5py.File(path, "r+") as file:
+        file["00000/predicted"][6] = [0.8, 0.8]
+    image = panel(picture(path), True)
+    bright = np.argwhere(image.max(axis=-1) > 120)
+    high, right = bright.mean(axis=0) / image.shape[:2]
+    assert high < 0.35
+    assert right > 0.7
+
+
+def test_what_is_not_finite_is_refused(tmp_path: Path, adaptive: Path) -> None:
+    with h5py.File(adaptive, "r+") as file:
+        file["00000/predicted"][6, 0] = np.nan
+    with pytest.raises(ValueError, match="positions that are not finite"):
+        animate(adaptive, tmp_path / "a.gif")
+    assert not (tmp_path / "a.gif").exists()
+
+
+def test_command(tmp_path: Path, adaptive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a.gif"
+    main(["animate", "--rollout", str(adaptive), "--out", str(out), "--every", "6"])
+    assert out.stat().st_size > 1000
+    for wrong in (["--trajectory", "2"], ["--every", "0"]):
+        with pytest.raises(SystemExit) as stopped:
+            main(["animate", "--rollout", str(adaptive), "--out", str(out), *wrong])
+        assert stopped.value.code == 2
+    assert "error: every, fps: got 0" in capsys.readouterr().out
+
+
+def in_three_dimensions(metadata: Metadata) -> Metadata:
+    vectors = ("velocity_mean", "velocity_std", "acceleration_mean", "acceleration_std")
+    return replace(
+        metadata,
+        dim=3,
+        bounds=((0.0, 1.0), (0.0, 1.0), (0.0, 2.0)),
+        periodic=(False, False, False),
+        **{name: (1.0, 1.0, 1.0) for name in vectors},
+    )
+
+
+def test_view_of_three_dimensions(metadata: Metadata) -> None:
+    view = View(in_three_dimensions(metadata))
+    positions = np.array([[0.2, 0.3, 0.1], [0.2, 0.3, 1.9], [0.9, 0.3, 0.1], [0.2, 0.9, 0.1]])
+    points, order = view.points(positions)
+    assert sorted(order) == [0, 1, 2, 3]
+    # The last axis points straight up; all that is in the bounds is in the picture.
+    assert points[1, 0] == pytest.approx(points[0, 0])
+    assert points[1, 1] > points[0, 1]
+    corners = view.frame.reshape(-1, 2)
+    assert len(view.frame) == 12
+    assert (corners > view.lower).all()
+    assert (corners < view.upper).all()
+    assert (points > view.lower).all()
+    assert (points < view.upper).all()
+
+
+def test_edges_through_a_periodic_boundary_are_not_drawn(metadata: Metadata) -> None:
+    view = View(replace(metadata, periodic=(True, False)))
+    positions = np.array([[0.11, 0.5], [0.12, 0.5], [0.89, 0.5]])
+    pairs = np.array([[0, 1, 0, 2], [1, 0, 2, 0]])
+    np.testing.assert_allclose(view.segments(positions, pairs), [positions[:2]])
+
+
+def test_periodic_positions_are_shown_inside_the_bounds(metadata: Metadata) -> None:
+    view = View(replace(metadata, periodic=(True, False)))
+    points, _ = view.points(np.array([[0.95, 0.95]]))
+    np.testing.assert_allclose(points, [[0.15, 0.95]])
