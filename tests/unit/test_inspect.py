@@ -1,0 +1,140 @@
+"""The inspect command's report."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from adaptgns.data import open_split
+from adaptgns.graph_statistics import graph_statistics
+from adaptgns.inspect import main
+
+
+def report(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    main(list(arguments))
+    return capsys.readouterr().out
+
+
+def row(report: str, name: str) -> list[str]:
+    """The cells of the first table row that begins with `name`."""
+    found = re.search(rf"^ {re.escape(name)} +\|(.*)$", report, re.MULTILINE)
+    assert found is not None, f"no row {name} in\n{report}"
+    return [cell.strip() for cell in found[1].split("|")]
+
+
+def test_report_of_a_good_data_set(drops: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = report(capsys, str(drops), "--frame", "20")
+    assert row(told, "train")[:2] == ["3", "40"]
+    assert row(told, "connectivity radius") == ["0.015"]
+    stored, computed = row(told, "acc_std")
+    assert stored == computed
+    graphs = [graph_statistics(t.positions[20], 0.015) for t in open_split(drops, "test")]
+    for name in ("nodes", "density", "mean degree", "mean clustering", "undirected edges"):
+        values = [getattr(graph, name.split()[-1]) for graph in graphs]
+        mean, std = map(float, row(told, name))
+        assert mean == pytest.approx(np.mean(values), rel=1e-3)
+        assert std == pytest.approx(np.std(values), rel=1e-2, abs=1e-9)
+    assert re.search(r"radius: r = 0\.01\d* gives 6 neighbours on average", told)
+    assert "no problems found" in told
+    assert "\x1b" not in told
+    assert told.isascii()
+
+
+def test_another_split_and_radius(drops: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = report(capsys, str(drops), "--split", "train", "--radius", "0.03")
+    assert "graph at r = 0.03, frame 100 (the last frame in 3 shorter ones), 3 traj" in told
+
+
+def test_narrow_terminals(
+    drops: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    tables = [line for line in report(capsys, str(drops)).splitlines() if "|" in line]
+    assert max(map(len, tables)) <= 40
+
+
+@pytest.fixture
+def spoiled(tmp_path: Path) -> Path:
+    """One of every problem."""
+    rng = np.random.default_rng(0)
+    for split in ("train", "test"):
+        with h5py.File(tmp_path / f"{split}.h5", "w") as file:
+            for index in range(3):
+                steps = rng.normal(0, 1e-3, (12, 30, 2)).cumsum(0)
+                positions = rng.uniform(0.2, 0.8, (30, 2)) + steps
+                file[f"{index:05d}/position"] = positions.astype(np.float32)
+                file[f"{index:05d}/particle_type"] = np.full(30, 5)
+    with h5py.File(tmp_path / "test.h5", "r+") as file:
+        file["00000/position"][11, 4] = np.nan
+        file["00001/position"][3, 7] = 1.5, 0.5
+    (tmp_path / "valid.npz").write_bytes(b"PK")
+    metadata = {
+        "dim": 2,
+        "dt": 0.1,
+        "bounds": [[0.0, 1.0], [0.0, 1.0]],
+        "default_connectivity_radius": 0.2,
+        "vel_mean": [0.0, 0.0],
+        "vel_std": [1e-2, 1e-3],
+        "acc_mean": [0.0, 0.0],
+        "acc_std": [1.4e-3, 1.4e-3],
+    }
+    (tmp_path / "metadata.json").write_text(json.dumps(metadata))
+    return tmp_path
+
+
+def test_problems_are_all_told(spoiled: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([str(spoiled)])
+    assert ended.value.code == 1
+    told = capsys.readouterr().out
+    problems = told[told.index("problems: ") :].splitlines()
+    assert problems[0] == "problems: 4"
+    expected = (
+        r"error: .*valid\.npz: not a readable npz",
+        r"warning: .*metadata\.json: vel_std is 0\.01 0\.001, but 0\.00\d+ 0\.00\d+ in train\.h5",
+        r"error: .*test\.h5: trajectory 00000: frame 11: particle 4 is at \[nan, nan\]",
+        r"warning: .*test\.h5: 1 of .* first trajectory 00001: frame 3: particle 7",
+    )
+    for pattern in expected:
+        assert sum(re.search(pattern, line) is not None for line in problems) == 1, pattern
+    assert "2 trajectories" in told[: told.index("problems: ")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--frame", "-1"], "frame is -1"),
+        (["--radius", "0"], "radius is 0.0"),
+        (["--radius", "nan"], "radius is nan"),
+    ],
+)
+def test_wrong_options(
+    drops: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([str(drops), *arguments])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_missing_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for data, message in ((tmp_path, "metadata.json: there is no such file"), ("x", "'x'")):
+        with pytest.raises(SystemExit) as ended:
+            main([str(data)])
+        assert ended.value.code == 2
+        assert message in capsys.readouterr().err
+
+
+def test_missing_split(drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("train.h5", "metadata.json"):
+        (tmp_path / name).write_bytes((drops / name).read_bytes())
+    with pytest.raises(SystemExit):
+        main([str(tmp_path)])
+    assert "no test.h5 or test.npz; the folder holds metadata.json, train" in (
+        capsys.readouterr().err
+    )
