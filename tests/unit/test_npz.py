@@ -272,6 +272,13 @@ def test_truncated_and_damaged_files(tmp_path: Path, write: str) -> None:
             np.testing.assert_array_equal(one.particle_type, other.particle_type)
 
 
+def test_a_file_replaced_after_opening(tmp_path: Path) -> None:
+    split = opened(tmp_path, record(9))
+    per_trajectory(tmp_path / "train.npz", [record(8)])
+    with pytest.raises(DataError, match=r"train\.npz: .*changed since the file was opened"):
+        split.window(0, 0, 7)
+
+
 def test_empty_archive(tmp_path: Path) -> None:
     np.savez(tmp_path / "train.npz")
     with pytest.raises(DataError, match=r"train\.npz: .*no trajectory"):

@@ -15,7 +15,7 @@ CACHE_BYTES = 1 << 30
 
 
 class TrajectoryCache:
-    """Least recently used trajectories, dropped once their positions exceed `limit` bytes."""
+    """Drops the least recently used once positions exceed `limit` bytes. For one thread."""
 
     def __init__(self, load: Callable[[int], Trajectory], limit: int = CACHE_BYTES) -> None:
         self._load = load

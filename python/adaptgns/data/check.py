@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from adaptgns.data.metadata import Metadata
     from adaptgns.data.trajectories import Trajectories
 
-_BLOCK_VALUES = 1 << 22
+_BLOCK_VALUES = 1 << 18
 """Numbers looked at together, so that a trajectory of any length fits."""
 
 _TOLERANCE = 1e-6

@@ -69,6 +69,7 @@ class NpzSource:
             raise DataError(f"{path}: holds no .npy member, so no trajectory")
         self._bundled = members == [f"{_BUNDLE}.npy"]
         self._members = members
+        self.shapes: tuple[Shape, ...] = ()
         self._forget()
         if self._bundled:
             loaded = self._load_bundle()
@@ -154,7 +155,7 @@ class NpzSource:
     def _load_member(self, index: int) -> Trajectory:
         name = self._members[index]
         trajectory = _trajectory(self._load(name), _stem(name), f"{self.path}: {_stem(name)}")
-        if hasattr(self, "shapes") and _shape(trajectory) != self.shapes[index]:
+        if self.shapes and _shape(trajectory) != self.shapes[index]:
             raise DataError(f"{self.path}: {name}: changed since the file was opened")
         return trajectory
 
