@@ -174,9 +174,8 @@ class Trainer:
             with torch.no_grad():
                 # Short memory at first: the initial weights should not linger.
                 decay = min(self.config.average, (1 + self.step) / (10 + self.step))
-                torch._foreach_lerp_(
-                    list(self.average.values()), list(self.simulator.state_dict().values()), 1 - decay
-                )
+                for name, weights in self.simulator.state_dict().items():
+                    self.average[name].lerp_(weights, 1 - decay)
         return loss.detach()
 
     def learning_rate(self) -> float:
