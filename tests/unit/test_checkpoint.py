@@ -27,7 +27,9 @@ from adaptgns.data.metadata import Metadata
 @pytest.fixture
 def checkpoint(small_config: TrainConfig, metadata: Metadata) -> Checkpoint:
     simulator = build_simulator(small_config, metadata)
-    return Checkpoint(small_config, metadata, 7, 0.5, with_prefix("model", simulator.state_dict()))
+    return Checkpoint(
+        small_config, metadata, 7, 0.5, with_prefix("model", simulator.state_dict())
+    )
 
 
 def test_round_trip(checkpoint: Checkpoint, tmp_path: Path) -> None:
