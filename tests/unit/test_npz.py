@@ -242,6 +242,12 @@ def test_dimensions_that_differ(tmp_path: Path) -> None:
         opened(tmp_path, record(), (np.zeros((8, 3, 3), np.float32), 5))
 
 
+def test_material_properties_that_differ(tmp_path: Path) -> None:
+    split = opened(tmp_path, record(material=True), record())
+    with pytest.raises(DataError, match=r"_1: 0 material properties, .*_0 has 1"):
+        split[1]
+
+
 def test_a_numeric_member_is_no_trajectory(tmp_path: Path) -> None:
     np.savez(tmp_path / "train.npz", positions=np.zeros((8, 3, 2)))
     with pytest.raises(DataError, match=r"positions\.npy: an array of dtype float64"):

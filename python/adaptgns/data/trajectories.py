@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,7 +73,8 @@ class Trajectories:
 
         Raises:
             IndexError: no such trajectory or frames.
-            DataError: the file is damaged, or a frame holds NaN or infinity.
+            DataError: the file is damaged, a frame holds NaN or infinity, or the trajectory has
+                other material properties than the first.
         """
         index = self._position(index)
         if not 0 <= start < stop <= self.lengths[index]:
@@ -82,11 +84,18 @@ class Trajectories:
             )
         trajectory = self._source.read(index, start, stop)
         check_finite(trajectory, start, f"{self.path}: trajectory {trajectory.name}")
+        material = trajectory.material_property
+        columns = 0 if material is None else material.shape[1]
+        if columns != self.material_properties:
+            raise DataError(
+                f"{self.path}: trajectory {trajectory.name}: {columns} material properties, "
+                f"trajectory {self.names[0]} has {self.material_properties}"
+            )
         return trajectory
 
-    @property
+    @cached_property
     def material_properties(self) -> int:
-        """Columns of `material_property`; 0 where there are none."""
+        """Columns of `material_property` in the first trajectory; 0 where there are none."""
         return self._source.material_properties()
 
     def _position(self, index: int) -> int:
