@@ -65,6 +65,8 @@ def test_layout_is_lagrangebench_s(tmp_path: Path) -> None:
 def save(path: Path, **members: Any) -> None:
     """One good trajectory, then one with these members."""
     good = {"position": np.zeros((9, 3, 2), np.float32), "particle_type": np.zeros(3, np.int64)}
+    if "material_property" in members:
+        good["material_property"] = np.zeros(3)
     with h5py.File(path, "w") as file:
         for name, value in good.items():
             file[f"00000/{name}"] = value
