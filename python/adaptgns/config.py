@@ -16,7 +16,7 @@ HISTORY = 6
 PARTICLE_TYPES = 9
 TYPE_EMBEDDING = 16
 
-Loss = Literal["nll", "mse"]
+Loss = Literal["nll", "beta-nll", "mse"]
 Preset = Literal["smoke", "laptop", "paper"]
 PolicyName = Literal["fixed", "adaptive", "two-pass", "random", "knn"]
 Device = Literal["auto", "cpu", "cuda"]
@@ -38,6 +38,8 @@ class ModelConfig:
     """Connect every particle with itself, too."""
     radius: float | None = None
     """Connectivity radius (length units of the data); None: the data set's own."""
+    walls: bool = False
+    """Hold particles inside the bounds of open axes, as solid walls do."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,8 @@ class TrainConfig:
     model: ModelConfig = field(default_factory=ModelConfig)
     adaptive: AdaptiveConfig = field(default_factory=AdaptiveConfig)
     loss: Loss = "nll"
-    """nll trains a variance beside the acceleration; mse the acceleration alone."""
+    """nll trains a variance beside the acceleration; beta-nll does and weighs hard particles more;
+    mse trains the acceleration alone."""
     graph: Literal["base", "adaptive"] = "base"
     """Graph seen in training; adaptive has the one-step lag of the rollout."""
     steps: int = 20_000

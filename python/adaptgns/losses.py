@@ -7,6 +7,8 @@ from torch import Tensor
 from adaptgns.config import Loss
 from adaptgns.network import Prediction
 
+BETA = 0.5
+
 
 def training_loss(kind: Loss, prediction: Prediction, target: Tensor, mobile: Tensor) -> Tensor:
     """The loss ``kind`` of normalized ``target`` accelerations ``[N, d]``; a scalar.
@@ -16,6 +18,8 @@ def training_loss(kind: Loss, prediction: Prediction, target: Tensor, mobile: Te
     - ``mse``: mean over particles and dimensions of the squared error.
     - ``nll``: mean over particles of |a' - a|^2 / (2 s^2) + (d/2) log s^2, the Gaussian negative
       log-likelihood up to a constant, with one variance s^2 per particle (Nix & Weigend 1994).
+    - ``beta-nll``: the same, each particle's term weighted by s^(2 BETA) without gradient, so that
+      particles with a large variance are not given up (Seitzer et al. 2022).
     """
     squared_error = (prediction.acceleration - target).square().sum(1)[mobile]  # [M]
     dim = target.shape[1]
@@ -24,4 +28,7 @@ def training_loss(kind: Loss, prediction: Prediction, target: Tensor, mobile: Te
     if prediction.variance is None:
         raise ValueError(f"loss: {kind} needs a network with a variance head; this one has none")
     variance = prediction.variance[mobile]
-    return (squared_error / (2 * variance) + dim / 2 * variance.log()).mean()
+    likelihood = squared_error / (2 * variance) + dim / 2 * variance.log()
+    if kind == "beta-nll":
+        likelihood = likelihood * variance.detach() ** BETA
+    return likelihood.mean()

@@ -62,6 +62,10 @@ class Simulator(nn.Module):
         constant("upper", bounds[:, 1])
         self.open_axes = open_axes
         constant("origin", [low for low, _ in metadata.bounds])
+        walls = zip(metadata.bounds, metadata.periodic, strict=True)
+        walls = [(-torch.inf, torch.inf) if periodic else pair for pair, periodic in walls]
+        constant("low", [low for low, _ in walls])
+        constant("high", [high for _, high in walls])
         constant("box", metadata.box if metadata.box is not None else [torch.inf] * dim)
 
     velocity_mean: Tensor
@@ -71,6 +75,8 @@ class Simulator(nn.Module):
     lower: Tensor
     upper: Tensor
     origin: Tensor
+    low: Tensor
+    high: Tensor
     box: Tensor
 
     def displacement(self, to: Tensor, start: Tensor) -> Tensor:
@@ -122,10 +128,13 @@ class Simulator(nn.Module):
 
     def advance(self, window: Tensor, acceleration: Tensor) -> Tensor:
         """The next positions ``[N, d]`` by semi-implicit Euler with one frame as the time unit:
-        v' = v + a, x' = x + v'; ``acceleration`` is normalized. Periodic axes are wrapped."""
+        v' = v + a, x' = x + v'; ``acceleration`` is normalized. Periodic axes are wrapped,
+        and ``walls`` hold."""
         velocity = self.displacement(window[:, -1], window[:, -2])
         velocity = velocity + acceleration * self.acceleration_std + self.acceleration_mean
         following = window[:, -1] + velocity
+        if self.config.walls:
+            following = following.clamp(self.low, self.high)
         if self.metadata.box is None:
             return following
         return following - self._periods(((following - self.origin) / self.box).floor())

@@ -1,6 +1,7 @@
 //! `adaptgns._core`: converts and validates arguments, releases the GIL, and calls
 //! the core crate. No algorithm lives here.
 
+mod arguments;
 mod errors;
 mod graph;
 mod mpm;

@@ -1,0 +1,364 @@
+//! Particles of one graph sorted into the cells of a grid.
+//!
+//! Cells are numbered along x first, so the cells `x - k ..= x + k` of a row hold one
+//! contiguous run of sorted particles, and the neighbours of a cell lie in 3 such runs
+//! (9 in three dimensions). The cost of a grid follows the particles and not the volume
+//! they span: where it would have many more cells than particles, only the rows that
+//! hold particles are stored.
+
+use std::ops::Range;
+
+use super::scalar::Scalar;
+
+/// Above this many cells per particle (plus a constant) a grid stores occupied rows only.
+const MOST_CELLS_PER_PARTICLE: usize = 16;
+
+pub(super) struct Grid<T, const D: usize> {
+    axes: [Axis; D],
+    rows: Rows<D>,
+    /// Coordinates in cell order, one array per axis, inside the box on periodic axes.
+    pub coords: [Vec<T>; D],
+    /// The caller's index of each sorted particle.
+    pub index: Vec<i32>,
+}
+
+/// How one axis is cut into cells.
+#[derive(Debug, Clone, Copy)]
+struct Axis {
+    origin: f64,
+    cells_per_length: f64,
+    count: u64,
+    periodic: bool,
+    /// A cutoff reaches at most this many cells to either side.
+    reach: u64,
+}
+
+/// Where the cells of each row begin among the sorted particles. A row is named by its
+/// number in `Dense` and by its position among the occupied rows in `Sparse`.
+enum Rows<const D: usize> {
+    Dense {
+        /// First particle of each cell, and one past the last particle.
+        starts: Vec<u32>,
+        /// Cell of each particle.
+        cell: Vec<u32>,
+    },
+    Sparse {
+        /// Cell coordinates of each row, x set to zero, in ascending order from the
+        /// last axis to the first.
+        keys: Vec<[u64; D]>,
+        /// First particle of each row, and one past the last particle.
+        starts: Vec<u32>,
+        /// Cell of each particle along x.
+        x: Vec<u64>,
+    },
+}
+
+impl Axis {
+    /// Cuts an axis into cells no smaller than `cutoff / reach`.
+    ///
+    /// Two particles closer than the cutoff must never lie more than `reach` cells
+    /// apart, whatever the rounding: the decision about an edge rounds a distance in
+    /// `T`, relative to the cutoff on an open axis and to the period on a periodic one,
+    /// and the cell rounds a coordinate in double precision, relative to the extent.
+    /// Each is covered with room to spare by widening the cells as much.
+    fn new<T: Scalar>(low: f64, high: f64, period: T, cutoff: f64, reach: u64) -> Self {
+        let periodic = period.is_finite();
+        let (origin, extent, slack) = if periodic {
+            (0.0, period.to_f64(), 4.0 * T::EPSILON)
+        } else {
+            (low, high - low, 4.0 * f64::EPSILON)
+        };
+        let width = (cutoff * (1.0 + 16.0 * T::EPSILON) + extent * slack) / reach as f64;
+        let count = if periodic {
+            ((extent / width) as u64).max(1)
+        } else {
+            (extent / width) as u64 + 1
+        };
+        let cells_per_length = if periodic {
+            count as f64 / extent
+        } else {
+            width.recip()
+        };
+        Self {
+            origin,
+            cells_per_length,
+            count,
+            periodic,
+            reach,
+        }
+    }
+
+    #[inline(always)]
+    fn cell<T: Scalar>(&self, x: T) -> u64 {
+        // A conversion from floating point saturates, so rounding just below the
+        // origin gives cell 0.
+        let cell = ((x.to_f64() - self.origin) * self.cells_per_length) as i64 as u64;
+        cell.min(self.count - 1)
+    }
+
+    /// The cells within reach of `cell`, each once, as one run and on a periodic axis
+    /// perhaps a second one.
+    #[inline(always)]
+    fn within_reach(&self, cell: u64) -> [Range<u64>; 2] {
+        let (k, n) = (self.reach, self.count);
+        if !self.periodic {
+            return [cell.saturating_sub(k)..n.min(cell + k + 1), 0..0];
+        }
+        if n <= 2 * k + 1 {
+            [0..n, 0..0]
+        } else if cell < k {
+            [0..cell + k + 1, n - (k - cell)..n]
+        } else if cell + k >= n {
+            [cell - k..n, 0..cell + k + 1 - n]
+        } else {
+            [cell - k..cell + k + 1, 0..0]
+        }
+    }
+}
+
+impl<T: Scalar, const D: usize> Grid<T, D> {
+    /// Sorts `positions` for searches up to `cutoff`; their caller's indices begin at
+    /// `first`. Within a cell particles keep their order.
+    pub fn new(positions: &[[T; D]], first: usize, period: &[T; D], cutoff: f64) -> Self {
+        if period.iter().any(|length| length.is_finite()) {
+            let wrapped: Vec<_> = positions.iter().map(|p| wrap(p, period)).collect();
+            Self::from_wrapped(&wrapped, first, period, cutoff)
+        } else {
+            Self::from_wrapped(positions, first, period, cutoff)
+        }
+    }
+
+    fn from_wrapped(positions: &[[T; D]], first: usize, period: &[T; D], cutoff: f64) -> Self {
+        let (low, high) = bounds(positions);
+        let most = MOST_CELLS_PER_PARTICLE * positions.len() + 1024;
+        // Finer cells along x tighten the runs that are searched and cost no more runs.
+        for x_reach in [2, 1] {
+            let axes: [Axis; D] = std::array::from_fn(|a| {
+                let reach = if a == 0 { x_reach } else { 1 };
+                Axis::new(low[a], high[a], period[a], cutoff, reach)
+            });
+            let cells = axes.iter().map(|axis| axis.count as f64).product::<f64>();
+            if cells <= (most / x_reach as usize) as f64 {
+                return Self::dense(positions, first, axes, cells as usize);
+            }
+            if x_reach == 1 {
+                return Self::sparse(positions, first, axes);
+            }
+        }
+        unreachable!("the last reach always returns")
+    }
+
+    /// A stable counting sort by cell number.
+    fn dense(positions: &[[T; D]], first: usize, axes: [Axis; D], cells: usize) -> Self {
+        let mut starts = vec![0_u32; cells + 1];
+        let cell_of: Vec<u32> = positions
+            .iter()
+            .map(|p| {
+                (0..D).rev().fold(0, |row, a| {
+                    row * axes[a].count as u32 + axes[a].cell(p[a]) as u32
+                })
+            })
+            .collect();
+        for &c in &cell_of {
+            starts[c as usize] += 1;
+        }
+        // From counts to ends; the sort below, from the last particle to the first,
+        // moves each end back to its start.
+        let mut total = 0;
+        for start in &mut starts {
+            total += *start;
+            *start = total;
+        }
+        let n = positions.len();
+        let mut index = vec![0_i32; n];
+        let mut cell = vec![0_u32; n];
+        let mut coords: [Vec<T>; D] = std::array::from_fn(|_| vec![T::default(); n]);
+        for (i, (&c, p)) in cell_of.iter().zip(positions).enumerate().rev() {
+            starts[c as usize] -= 1;
+            let slot = starts[c as usize] as usize;
+            index[slot] = (first + i) as i32;
+            cell[slot] = c;
+            for a in 0..D {
+                coords[a][slot] = p[a];
+            }
+        }
+        Self {
+            axes,
+            rows: Rows::Dense { starts, cell },
+            coords,
+            index,
+        }
+    }
+
+    fn sparse(positions: &[[T; D]], first: usize, axes: [Axis; D]) -> Self {
+        // Cell coordinates from the last axis to the first, then the index.
+        let mut order: Vec<([u64; D], u32)> = (0_u32..)
+            .zip(positions)
+            .map(|(i, p)| {
+                (
+                    std::array::from_fn(|a| axes[D - 1 - a].cell(p[D - 1 - a])),
+                    i,
+                )
+            })
+            .collect();
+        order.sort_unstable();
+        let mut keys = Vec::new();
+        let mut starts = Vec::new();
+        for (slot, &(mut key, _)) in (0_u32..).zip(&order) {
+            key[D - 1] = 0;
+            if keys.last() != Some(&key) {
+                keys.push(key);
+                starts.push(slot);
+            }
+        }
+        starts.push(order.len() as u32);
+        let at = |slot: usize| order[slot].1 as usize;
+        let n = order.len();
+        Self {
+            axes,
+            rows: Rows::Sparse {
+                keys,
+                starts,
+                x: order.iter().map(|(key, _)| key[D - 1]).collect(),
+            },
+            coords: std::array::from_fn(|a| (0..n).map(|s| positions[at(s)][a]).collect()),
+            index: (0..n).map(|s| (first + at(s)) as i32).collect(),
+        }
+    }
+
+    /// Calls `visit(receivers, candidates)` for the particles of each occupied cell
+    /// among the sorted particles `slots`, in order: the candidates are the runs of
+    /// sorted particles that hold every particle within the cutoff of any receiver,
+    /// each once.
+    pub fn for_each_cell(
+        &self,
+        slots: Range<usize>,
+        mut visit: impl FnMut(Range<usize>, &[Range<usize>]),
+    ) {
+        if slots.is_empty() {
+            return;
+        }
+        let mut slot = slots.start;
+        let mut row = self.rows.row_of(slot, &self.axes);
+        let mut row_end = 0;
+        let mut neighbours = Vec::new();
+        let mut candidates = Vec::new();
+        while slot < slots.end {
+            if slot >= row_end {
+                row = self.rows.row_of(slot, &self.axes);
+                row_end = self.rows.cell_start(row, self.axes[0].count, &self.axes);
+                self.neighbour_rows(row, &mut neighbours);
+            }
+            let x = self.rows.x_of(row, slot, &self.axes);
+            let end = self.rows.cell_start(row, x + 1, &self.axes).min(slots.end);
+            candidates.clear();
+            for run in self.axes[0].within_reach(x) {
+                if !run.is_empty() {
+                    candidates.extend(neighbours.iter().map(|&row| {
+                        self.rows.cell_start(row, run.start, &self.axes)
+                            ..self.rows.cell_start(row, run.end, &self.axes)
+                    }));
+                }
+            }
+            visit(slot..end, &candidates);
+            slot = end;
+        }
+    }
+
+    /// The rows within reach of `row`, itself included, each once.
+    fn neighbour_rows(&self, row: usize, neighbours: &mut Vec<usize>) {
+        neighbours.clear();
+        let y_axis = &self.axes[1];
+        let [y, z] = match &self.rows {
+            Rows::Dense { .. } => [row as u64 % y_axis.count, row as u64 / y_axis.count],
+            Rows::Sparse { keys, .. } => {
+                let key = &keys[row];
+                if D == 2 {
+                    [key[0], 0]
+                } else {
+                    [key[1], key[0]]
+                }
+            }
+        };
+        let z_runs = if D == 3 {
+            self.axes[2].within_reach(z)
+        } else {
+            [0..1, 0..0]
+        };
+        for z in z_runs.into_iter().flatten() {
+            for y in y_axis.within_reach(y).into_iter().flatten() {
+                match &self.rows {
+                    Rows::Dense { .. } => neighbours.push((z * y_axis.count + y) as usize),
+                    Rows::Sparse { keys, .. } => {
+                        let mut key = [0; D];
+                        key[D - 2] = y;
+                        if D == 3 {
+                            key[0] = z;
+                        }
+                        neighbours.extend(keys.binary_search(&key));
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl<const D: usize> Rows<D> {
+    /// The row that holds a particle.
+    fn row_of(&self, slot: usize, axes: &[Axis; D]) -> usize {
+        match self {
+            Rows::Dense { cell, .. } => cell[slot] as usize / axes[0].count as usize,
+            Rows::Sparse { starts, .. } => starts.partition_point(|&s| s as usize <= slot) - 1,
+        }
+    }
+
+    /// The cell along x of a particle in `row`.
+    #[inline(always)]
+    fn x_of(&self, row: usize, slot: usize, axes: &[Axis; D]) -> u64 {
+        match self {
+            Rows::Dense { cell, .. } => u64::from(cell[slot]) - row as u64 * axes[0].count,
+            Rows::Sparse { x, .. } => x[slot],
+        }
+    }
+
+    /// The first particle of `row` whose cell along x is at least `x`.
+    #[inline(always)]
+    fn cell_start(&self, row: usize, x: u64, axes: &[Axis; D]) -> usize {
+        match self {
+            Rows::Dense { starts, .. } => {
+                starts[row * axes[0].count as usize + x as usize] as usize
+            }
+            Rows::Sparse {
+                starts, x: cells, ..
+            } => {
+                let (begin, end) = (starts[row] as usize, starts[row + 1] as usize);
+                begin + cells[begin..end].partition_point(|&cell| cell < x)
+            }
+        }
+    }
+}
+
+pub(super) fn bounds<T: Scalar, const D: usize>(positions: &[[T; D]]) -> ([f64; D], [f64; D]) {
+    let Some(&first) = positions.first() else {
+        return ([0.0; D], [0.0; D]);
+    };
+    let (low, high) = positions.iter().fold((first, first), |(low, high), p| {
+        (
+            std::array::from_fn(|a| low[a].lesser(p[a])),
+            std::array::from_fn(|a| high[a].greater(p[a])),
+        )
+    });
+    (low.map(T::to_f64), high.map(T::to_f64))
+}
+
+/// Moves a position into the box along its periodic axes.
+pub(super) fn wrap<T: Scalar, const D: usize>(position: &[T; D], period: &[T; D]) -> [T; D] {
+    std::array::from_fn(|a| {
+        if !period[a].is_finite() {
+            return position[a];
+        }
+        let (x, length) = (position[a].to_f64(), period[a].to_f64());
+        // Rounding may give the period itself, never more, which is the box's other end.
+        T::from_f64((x - length * (x / length).floor()).clamp(0.0, length))
+    })
+}
