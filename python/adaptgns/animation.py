@@ -179,7 +179,7 @@ class Animation:
         self._curve(edges, true_edges, TRUE)
         self._curve(edges, rollout.edges, PREDICTED)
         edges.set_ylim(bottom=0)
-        edges.yaxis.set_major_locator(MaxNLocator(3))
+        edges.yaxis.set_major_locator(MaxNLocator(3, integer=True))
         edges.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         mse = self._strip(0.565, "position MSE")
         mse.set_yscale("log")
