@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 from PIL import Image
@@ -158,17 +159,15 @@ class Animation:
         else:
             seen = self._sigma[self.shown][:, self._mobile]
             low, high = np.percentile(seen, CLIPPED) if seen.size else (1.0, 1.0)
+            low = max(low, float(np.finfo(np.float32).tiny))  # a logarithmic scale has no zero
             scale = LogNorm(low, max(high, 1.01 * low))
             self._cloud = cloud(model, self._sigma, SIGMA_MAP, scale)
             label = "predicted σ"
         self._moving += [*self._true_cloud.artists, *self._cloud.artists]
         self._scale(truth, self._true_cloud.points, "speed")
         self._scale(model, self._cloud.points, label)
-        self._label = truth.text(
-            1.0, 1.02, "", color=TEXT, fontsize=SMALL, ha="right", transform=truth.transAxes
-        )
-        self._label.set_animated(True)
-        self._moving.append(self._label)
+        self._step = self._text(truth, 1.0, 1.02)
+        self._lost = self._text(model, 0.96, 0.93)
 
     def _build_strips(self, rollout: Rollout) -> None:
         """The curves below, and the cursors that run along them."""
@@ -180,7 +179,7 @@ class Animation:
         self._curve(edges, true_edges, TRUE)
         self._curve(edges, rollout.edges, PREDICTED)
         edges.set_ylim(bottom=0)
-        edges.yaxis.set_major_locator(MaxNLocator(3))
+        edges.yaxis.set_major_locator(MaxNLocator(3, integer=True))
         edges.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         mse = self._strip(0.565, "position MSE")
         mse.set_yscale("log")
@@ -202,7 +201,9 @@ class Animation:
         base, extra = self._edges(row)
         self._base_lines.set_segments(list(self._view.segments(positions, base)))
         self._extra_lines.set_segments(list(self._view.segments(positions, extra)))
-        self._label.set_text(f"step {row + 1} of {self._steps}")
+        self._step.set_text(f"step {row + 1} of {self._steps}")
+        lost = self._view.outside(positions)
+        self._lost.set_text(f"{lost:,} out of sight" if lost else "")
         for cursor in self._cursors:
             cursor.set_xdata([row + 1, row + 1])
 
@@ -250,6 +251,21 @@ class Animation:
         width = panel.get_position().width * WIDTH * POINTS_PER_INCH
         scale = width / float((self._view.upper - self._view.lower).max())
         return float(np.clip(MARKER * self._file.metadata.radius * scale, 1.6, 8.0)) ** 2
+
+    def _text(self, axes: Axes, right: float, bottom: float) -> Text:
+        """A text that changes, with its lower right corner at a place in units of ``axes``."""
+        text = axes.text(
+            right,
+            bottom,
+            "",
+            color=TEXT,
+            fontsize=SMALL,
+            ha="right",
+            transform=axes.transAxes,
+            animated=True,
+        )
+        self._moving.append(text)
+        return text
 
     def _lines(self, axes: Axes, colour: str, width: float) -> LineCollection:
         lines = LineCollection([], colors=colour, linewidths=width, animated=True)

@@ -54,6 +54,11 @@ class View:
         seen = self._wrapped(positions) @ self._axes.T
         return seen[:, :2], np.argsort(seen[:, 2], kind="stable")
 
+    def outside(self, positions: Floats) -> int:
+        """How many of ``positions`` ``[N, d]`` the picture does not show."""
+        seen = self._wrapped(positions) @ self._axes[:2].T
+        return int(((seen < self.lower) | (seen > self.upper)).any(axis=1).sum())
+
     def segments(self, positions: Floats, pairs: NDArray[np.int64]) -> NDArray[np.float64]:
         """``[lines, 2, 2]`` ends of the edges ``pairs`` ``[2, E]``, each drawn once.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -36,6 +37,11 @@ def test_figures_of_a_known_error(tmp_path: Path, metadata: Metadata) -> None:
     np.testing.assert_allclose(rollout.curves["mse"], 1e-6 * np.arange(1, 13) ** 2, rtol=2e-2)
     # Moving everything but the kinematic particles' counterparts aside keeps all pairs as they are.
     assert rollout.mean("clumping@5") == pytest.approx(1.0, abs=0.05)
+    np.testing.assert_allclose(
+        rollout.curves["edges_within_radius"][4] / rollout.curves["edges_within_radius_true"][4],
+        rollout.mean("clumping@5"),
+        rtol=0.05,
+    )
     assert rollout.mean("edges_per_step") == 10
     assert (rollout.mean("graph_ms"), rollout.mean("model_ms")) == (0.5, 2.0)
     assert report.trajectories == ["block 0", "block 1"]
@@ -144,6 +150,12 @@ def test_only_the_same_trajectories_are_compared(tmp_path: Path, metadata: Metad
         file["00001/initial"][0, 0, 0] += 0.01
     with pytest.raises(ValueError, match=r"trajectory 1 .* differs in its initial positions"):
         measure([first, other])
+
+
+def test_kinematic_particles_alone_can_not_be_measured(tmp_path: Path, metadata: Metadata) -> None:
+    walls = replace(metadata, kinematic_types=(3, 5))
+    with pytest.raises(ValueError, match=r"block 0 .* has kinematic particles only"):
+        measure([write_rollout(tmp_path / "r.h5", walls)])
 
 
 def test_radius_of_the_graph_is_named_where_it_is_not_the_trained_one(

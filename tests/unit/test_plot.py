@@ -150,3 +150,8 @@ def test_periodic_positions_are_shown_inside_the_bounds(metadata: Metadata) -> N
     view = View(replace(metadata, periodic=(True, False)))
     points, _ = view.points(np.array([[0.95, 0.95]]))
     np.testing.assert_allclose(points, [[0.15, 0.95]])
+
+
+def test_particles_out_of_sight_are_counted(metadata: Metadata) -> None:
+    positions = np.array([[0.5, 0.5], [0.895, 0.105], [0.5, -3.0], [1.2, 1.2], [0.5, 0.95]])
+    assert View(metadata).outside(positions) == 3
