@@ -22,12 +22,16 @@ PRESETS: dict[Preset, TrainConfig] = {
     # About five minutes of training on two cores; docs/recipe.md says how it was found.
     "laptop": TrainConfig(
         preset="laptop",
-        model=ModelConfig(latent=64, steps=5),
-        steps=10_000,
+        model=ModelConfig(latent=64, steps=5, walls=True),
+        steps=9_000,
+        batch=4,
         lr=1e-3,
         schedule="cosine",
         warmup=200,
+        noise=3e-4,
+        position_correction=0.1,
         mirror=True,
+        validate_every=3_000,
         test_trajectories=10,
     ),
     # The paper's sizes (and geoelements/gns's schedule).

@@ -30,12 +30,12 @@ EMBEDDED: tuple[SceneName, ...] = tuple(SCENES)
 DEFAULT_SETS: dict[SceneName, dict[str, SplitPlan]] = {
     # Training on small drops fits more steps into the time; what is measured is full size.
     "waterdrop": {
-        "train": SplitPlan("waterdrop", 200, frames=300, seed=0, particles=(100, 300)),
+        "train": SplitPlan("waterdrop", 400, frames=300, seed=0, particles=(40, 200)),
         "valid": SplitPlan("waterdrop", 10, frames=400, seed=0),
         "test": SplitPlan("waterdrop", 30, frames=400, seed=0),
     },
     "sand": {
-        "train": SplitPlan("sand", 200, frames=320, seed=0, particles=(100, 300)),
+        "train": SplitPlan("sand", 400, frames=320, seed=0, particles=(40, 200)),
         "valid": SplitPlan("sand", 10, frames=320, seed=0),
         "test": SplitPlan("sand", 30, frames=320, seed=0),
     },
