@@ -83,3 +83,11 @@ def knn_graph(
     threads: int | None = None,
     return_offsets: Literal[True],
 ) -> _Graph: ...
+def simulate(
+    scene: str,
+    *,
+    seed: int,
+    frames: int,
+    dim: int = 2,
+    particles: tuple[int, int] | None = None,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]: ...

@@ -10,10 +10,11 @@ import cattrs
 import torch
 from cattrs.preconf.json import make_converter
 
-HISTORY = 6
+from adaptgns.data.trajectory import INPUT_FRAMES
+
+HISTORY = INPUT_FRAMES
 """Positions the network looks at: the current one and the five before it."""
 
-PARTICLE_TYPES = 9
 TYPE_EMBEDDING = 16
 
 Loss = Literal["nll", "beta-nll", "mse"]
@@ -107,6 +108,8 @@ class TrainConfig:
     """Optimizer steps."""
     batch: int = 2
     """Samples (windows of one trajectory) per step."""
+    batch_particles: int | None = None
+    """Particles per step at most, where the next sample would exceed it; None: unlimited."""
     lr: float = 1e-4
     """Learning rate at its highest."""
     lr_final: float = 1e-6
@@ -152,11 +155,14 @@ class TrainConfig:
 
 T = TypeVar("T")
 
+
 def torch_device(name: Device) -> torch.device:
     """The device that ``name`` means on this machine."""
     if name == "cuda" and not torch.cuda.is_available():
         raise ValueError("device: got cuda, but torch finds no GPU here; accepted are auto and cpu")
-    return torch.device("cuda" if name == "auto" and torch.cuda.is_available() else name.replace("auto", "cpu"))
+    return torch.device(
+        "cuda" if name == "auto" and torch.cuda.is_available() else name.replace("auto", "cpu")
+    )
 
 
 _converter = make_converter(forbid_extra_keys=True)

@@ -10,9 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -22,11 +24,17 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from adaptgns.checkpoint import BEST, LAST, Checkpoint, build_simulator, with_prefix, write_checkpoint
+from adaptgns.checkpoint import (
+    BEST,
+    LAST,
+    Checkpoint,
+    build_simulator,
+    with_prefix,
+    write_checkpoint,
+)
 from adaptgns.config import HISTORY, TrainConfig, torch_device
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
@@ -42,7 +50,7 @@ LOG_EVERY = 100
 """Steps between lines of the metrics log."""
 
 
-class TrainingStopped(Exception):
+class TrainingStopped(Exception):  # noqa: N818 (not an error: nothing is lost)
     """Training ended before its last step; the message says why and how to go on."""
 
 
@@ -54,6 +62,7 @@ class Trainer:
         config: TrainConfig,
         metadata: Metadata,
         folder: Path,
+        *,
         train: Trajectories,
         valid: Trajectories | None,
         checkpoint: Checkpoint | None = None,
@@ -73,7 +82,7 @@ class Trainer:
         self.windows = Windows(train, metadata, config, noise=config.noise)
         if not len(self.windows):
             raise ValueError(
-                f"{train.path}: no trajectory has the {self.windows.frames} frames that a sample needs"
+                f"{train.path}: a sample needs {self.windows.frames} frames; no trajectory has them"
             )
 
     def _restore(self, checkpoint: Checkpoint) -> None:
@@ -128,7 +137,9 @@ class Trainer:
             interruption() as interrupted,
             progress,
         ):
-            task = progress.add_task("", total=config.steps, completed=self.step, loss="-", speed="-")
+            task = progress.add_task(
+                "", total=config.steps, completed=self.step, loss="-", speed="-"
+            )
             logged = time.perf_counter()
             while self.step < config.steps:
                 losses.append(self.train_step(next(batches).to(self.device)))
@@ -139,7 +150,8 @@ class Trainer:
                     loss = self._mean_loss(losses)
                     speed = len(losses) / (time.perf_counter() - logged)
                     log.write(
-                        self.step, {"loss": loss, "lr": self.learning_rate(), "steps_per_second": speed}
+                        self.step,
+                        {"loss": loss, "lr": self.learning_rate(), "steps_per_second": speed},
                     )
                     progress.update(task, loss=f"{loss:.4g}", speed=f"{speed:.1f}")
                     losses.clear()
@@ -153,8 +165,8 @@ class Trainer:
                     self.save()
                 if interrupted and not last:
                     raise TrainingStopped(
-                        f"stopped by {interrupted[0]} after step {self.step}; nothing is lost. Go on with\n"
-                        f"  python -m adaptgns.train --resume {self.folder}"
+                        f"stopped by {interrupted[0]} after step {self.step}; nothing is lost. "
+                        f"Go on with\n  python -m adaptgns.train --resume {self.folder}"
                     )
 
     def train_step(self, batch: Batch) -> Tensor:
@@ -181,12 +193,15 @@ class Trainer:
     def learning_rate(self) -> float:
         """The learning rate of the current step."""
         c = self.config
+        decayed: float
         if self.step < c.warmup:
             return c.lr * (self.step + 1) / c.warmup
         if c.schedule == "exponential":
-            return c.lr_final + (c.lr - c.lr_final) * 0.1 ** (self.step / 5e6)
-        progress = (self.step - c.warmup) / max(1, c.steps - c.warmup)
-        return c.lr_final + (c.lr - c.lr_final) * 0.5 * (1 + math.cos(math.pi * progress))
+            decayed = 0.1 ** (self.step / 5e6)
+        else:
+            progress = (self.step - c.warmup) / max(1, c.steps - c.warmup)
+            decayed = 0.5 * (1 + math.cos(math.pi * progress))
+        return c.lr_final + (c.lr - c.lr_final) * decayed
 
     def _lagged_graph(self, batch: Batch) -> Graph:
         """The adaptive graph that a rollout would have here: its sigma comes from a pass without
@@ -267,7 +282,11 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
     shortest = min(map(len, curves))
     curve = np.mean([c[:shortest] for c in curves], axis=0)
     scores = {f"valid_mse_{k}": float(curve[k - 1]) for k in (50, 100, 200) if k <= shortest}
-    return {"valid_rollout_mse": float(curve.mean()), "valid_one_step": float(np.mean(one_step)), **scores}
+    return {
+        "valid_rollout_mse": float(curve.mean()),
+        "valid_one_step": float(np.mean(one_step)),
+        **scores,
+    }
 
 
 class Log:
@@ -310,7 +329,7 @@ def interruption() -> Iterator[list[str]]:
     A second signal acts as it would have without this.
     """
     received: list[str] = []
-    previous = {}
+    previous: dict[int, Any] = {}
 
     def note(number: int, _: FrameType | None) -> None:
         received.append(signal.Signals(number).name)

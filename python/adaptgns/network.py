@@ -5,11 +5,12 @@ Shapes: N particles, E edges, L latent width.
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional
 
 from adaptgns.segment import Graph, at_receivers, at_senders, sum_at_receivers
 
@@ -27,10 +28,10 @@ class Prediction(NamedTuple):
 
 
 def mlp(inputs: int, width: int, hidden_layers: int, outputs: int, *, norm: bool) -> nn.Sequential:
-    """``hidden_layers`` ReLU layers of ``width``, a linear output, a LayerNorm after it if asked."""
+    """``hidden_layers`` ReLU layers of ``width``, a linear output, and a LayerNorm if asked."""
     sizes = [inputs, *[width] * hidden_layers]
     layers: list[nn.Module] = []
-    for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+    for a, b in itertools.pairwise(sizes):
         layers += [nn.Linear(a, b), nn.ReLU()]
     layers.append(nn.Linear(sizes[-1], outputs))
     if norm:
@@ -55,9 +56,9 @@ class InteractionLayer(nn.Module):
         first = self.edge_mlp[0]
         assert isinstance(first, nn.Linear)
         receiver_part, sender_part, edge_part = first.weight.chunk(3, dim=1)
-        hidden = F.linear(edges, edge_part, first.bias)  # [E, L]
-        hidden = hidden + at_receivers(F.linear(nodes, receiver_part), graph)
-        hidden = hidden + at_senders(F.linear(nodes, sender_part), graph)
+        hidden = functional.linear(edges, edge_part, first.bias)  # [E, L]
+        hidden = hidden + at_receivers(functional.linear(nodes, receiver_part), graph)
+        hidden = hidden + at_senders(functional.linear(nodes, sender_part), graph)
         messages = self.edge_mlp[1:](hidden)
         incoming = sum_at_receivers(messages, graph)  # [N, L]
         update = self.node_mlp(torch.cat([incoming, nodes], dim=1))
@@ -111,5 +112,5 @@ class EncodeProcessDecode(nn.Module):
                 nodes, edges = layer(nodes, edges, graph)
         variance = None
         if self.variance_head is not None:
-            variance = F.softplus(self.variance_head(nodes)).squeeze(1) + VARIANCE_FLOOR
+            variance = functional.softplus(self.variance_head(nodes)).squeeze(1) + VARIANCE_FLOOR
         return Prediction(self.decoder(nodes), variance)

@@ -105,7 +105,7 @@ class TwoPass:
 
 @dataclass(frozen=True)
 class Random:
-    """The same share of particles as in :class:`Adaptive`, drawn anew at every step: the control."""
+    """As many particles as in :class:`Adaptive` see farther, drawn at every step: the control."""
 
     rule: AdaptiveConfig
     rng: np.random.Generator
@@ -124,7 +124,12 @@ class NearestNeighbours:
 
     def edges(self, state: State) -> Edges:
         return knn_graph(
-            state.positions, self.k, ptr=state.ptr, box=state.box, self_edges=state.self_edges, return_offsets=True
+            state.positions,
+            self.k,
+            ptr=state.ptr,
+            box=state.box,
+            self_edges=state.self_edges,
+            return_offsets=True,
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -16,8 +17,8 @@ from rich.progress import Progress
 
 from adaptgns.checkpoint import read_checkpoint
 from adaptgns.config import HISTORY, RolloutConfig, to_json, torch_device
-from adaptgns.data.trajectories import Trajectory, open_split
 from adaptgns.data.default import dataset_folder
+from adaptgns.data.trajectories import Trajectory, open_split
 from adaptgns.network import Prediction
 from adaptgns.policies import Edges, Policy, State, make_policy
 from adaptgns.rollout_file import RolloutWriter
@@ -65,8 +66,8 @@ def steps(
     device = simulator.lower.device
     true = torch.from_numpy(trajectory.positions).to(device)  # [T, N, d]
     particle_type = torch.from_numpy(trajectory.particle_type).to(device)
-    material = trajectory.material_property
-    material = None if material is None else torch.from_numpy(material).to(device)
+    given = trajectory.material_property
+    material = None if given is None else torch.from_numpy(given).to(device)
     mobile = ~np.isin(trajectory.particle_type, simulator.metadata.kinematic_types)
     kinematic = torch.from_numpy(~mobile).to(device)
     window = true[:HISTORY].transpose(0, 1).contiguous()  # [N, H, d]
@@ -131,7 +132,7 @@ def to_sigma(prediction: Prediction) -> NDArray[np.float32]:
 def directed_edges(edges: Edges, self_edges: bool) -> int:
     """Number of directed edges between different particles."""
     index, offsets = edges
-    return index.shape[1] - (len(offsets) - 1) * self_edges
+    return int(index.shape[1]) - (len(offsets) - 1) * self_edges
 
 
 def write_rollouts(config: RolloutConfig, console: Console) -> None:
@@ -158,26 +159,25 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
             frames = len(trajectory.positions) - HISTORY
             horizon = frames if config.steps is None else min(config.steps, frames)
 
-            def roll(teacher_forcing: bool) -> Iterator[Step]:
-                policy = make_policy(
-                    config.policy, config.adaptive, k=config.k, seed=config.seed + index
-                )
-                return steps(
-                    simulator,
-                    trajectory,
-                    policy,
-                    horizon,
-                    radius=config.radius,
-                    teacher_forcing=teacher_forcing,
-                )
-
-            one_step = islice(enumerate(roll(True), start=HISTORY), 0, None, config.one_step_every)
-            writer.add(trajectory, roll(False), one_step)
+            roll = partial(steps, simulator, trajectory, count=horizon, radius=config.radius)
+            # A policy each: the random one goes on drawing from where it was.
+            free, forced = (
+                make_policy(config.policy, config.adaptive, k=config.k, seed=config.seed + index)
+                for _ in range(2)
+            )
+            one_step = enumerate(roll(policy=forced, teacher_forcing=True), start=HISTORY)
+            writer.add(
+                trajectory,
+                roll(policy=free),
+                islice(one_step, 0, None, config.one_step_every),
+            )
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
-    config = tyro.cli(RolloutConfig, args=argv, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+    config = tyro.cli(
+        RolloutConfig, args=argv, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)
+    )
     console = Console()
     try:
         write_rollouts(config, console)

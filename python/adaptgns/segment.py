@@ -63,7 +63,7 @@ class _SegmentSum(torch.autograd.Function):
         return embedding_bag(rows, values, offsets, mode="sum", include_last_offset=True)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (receivers,) = ctx.saved_tensors
         return gradient.index_select(0, receivers), None, None
 
@@ -75,7 +75,7 @@ class _Gather(torch.autograd.Function):
         return nodes.index_select(0, index)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
         order, offsets = ctx.saved_tensors
         summed = embedding_bag(
             order, gradient.contiguous(), offsets, mode="sum", include_last_offset=True

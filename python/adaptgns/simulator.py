@@ -10,8 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from adaptgns.config import HISTORY, PARTICLE_TYPES, TYPE_EMBEDDING, ModelConfig
+from adaptgns.config import HISTORY, TYPE_EMBEDDING, ModelConfig
 from adaptgns.data.metadata import Metadata
+from adaptgns.data.trajectory import PARTICLE_TYPES
 from adaptgns.network import EncodeProcessDecode, Prediction
 from adaptgns.segment import Graph
 
@@ -62,8 +63,10 @@ class Simulator(nn.Module):
         constant("upper", bounds[:, 1])
         self.open_axes = open_axes
         constant("origin", [low for low, _ in metadata.bounds])
-        walls = zip(metadata.bounds, metadata.periodic, strict=True)
-        walls = [(-torch.inf, torch.inf) if periodic else pair for pair, periodic in walls]
+        walls = [
+            (-torch.inf, torch.inf) if periodic else pair
+            for pair, periodic in zip(metadata.bounds, metadata.periodic, strict=True)
+        ]
         constant("low", [low for low, _ in walls])
         constant("high", [high for _, high in walls])
         constant("box", metadata.box if metadata.box is not None else [torch.inf] * dim)

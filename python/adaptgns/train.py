@@ -15,6 +15,7 @@ from rich.console import Console
 from adaptgns.atomic import written_whole
 from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint
 from adaptgns.config import PolicyName, RolloutConfig, TrainConfig, from_json, to_json
+from adaptgns.data.check import check_split
 from adaptgns.data.default import dataset_folder
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
@@ -49,7 +50,7 @@ def parse(arguments: list[str]) -> TrainConfig:
     resume, arguments = _take(arguments, "--resume")
     if preset is not None and preset not in PRESETS:
         raise ValueError(f"--preset: got {preset!r}; accepted are {', '.join(PRESETS)}")
-    default = PRESETS[preset or "laptop"]  # type: ignore[index]
+    default = PRESETS[preset or "laptop"]
     if resume is not None:
         folder = Path(resume)
         default = replace(read_checkpoint(folder / LAST).config, resume=folder, out=folder)
@@ -86,8 +87,10 @@ def train(config: TrainConfig, console: Console) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with written_whole(folder / CONFIG) as partial:
         partial.write_text(json.dumps(to_json(config), indent=1))
+    train_split, valid_split = open_split(data, "train"), open_split(data, "valid")
+    check_split(train_split, metadata)
     trainer = Trainer(
-        config, metadata, folder, open_split(data, "train"), open_split(data, "valid"), checkpoint
+        config, metadata, folder, train=train_split, valid=valid_split, checkpoint=checkpoint
     )
     console.print(
         f"training on {data}: {len(trainer.windows):,} windows, "

@@ -7,8 +7,10 @@ depends neither on the number of loading workers nor on where it was interrupted
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import count, islice
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,15 +73,15 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         """The same batch on another device."""
-        moved = {
-            name: None if value is None else value.to(device, non_blocking=True)
-            for name, value in vars(self).items()
-        }
-        return Batch(**moved)
+        return self._with(lambda part: part.to(device, non_blocking=True))
 
     def pin_memory(self) -> Batch:
         """The same batch in page-locked memory; torch's DataLoader calls this."""
-        return Batch(**{n: None if v is None else v.pin_memory() for n, v in vars(self).items()})
+        return self._with(lambda part: part.pin_memory())
+
+    def _with(self, change: Callable[[Any], Any]) -> Batch:
+        parts = {name: part for name, part in vars(self).items() if part is not None}
+        return replace(self, **{name: change(part) for name, part in parts.items()})
 
 
 class Windows(Dataset[Sample]):
@@ -93,9 +95,9 @@ class Windows(Dataset[Sample]):
         self.config = config
         self.noise = noise
         self.frames = HISTORY + 1 + (config.graph == "adaptive")
-        self.starts = np.concatenate(
-            [[0], np.cumsum(np.maximum(trajectories.lengths - self.frames + 1, 0))]
-        )
+        counts = np.maximum(trajectories.lengths - self.frames + 1, 0)
+        self.starts = np.concatenate([[0], np.cumsum(counts)])
+        self.particles = np.repeat(trajectories.particle_counts, counts)
 
     def __len__(self) -> int:
         return int(self.starts[-1])
@@ -106,7 +108,7 @@ class Windows(Dataset[Sample]):
         trajectory = int(np.searchsorted(self.starts, number, side="right")) - 1
         start = int(number - self.starts[trajectory])
         window = self.trajectories.window(trajectory, start, start + self.frames)
-        positions = np.array(window.positions)
+        positions = window.positions
         mobile = self.mobile(window.particle_type)
         if self.config.mirror and rng.random() < 0.5:
             positions[..., 0] = np.float32(sum(self.metadata.bounds[0])) - positions[..., 0]
@@ -153,34 +155,62 @@ class Windows(Dataset[Sample]):
 
 
 class ShuffledKeys(Sampler[list[Key]]):
-    """The keys of each batch from step ``first`` to step ``last``: epoch after epoch, each a
-    permutation drawn from (seed, epoch). A batch may straddle two epochs; no window is left out."""
+    """The keys of each batch from step ``first`` to step ``last``.
 
-    def __init__(self, windows: int, batch: int, seed: int, first: int, last: int) -> None:
-        self.windows, self.batch, self.seed = windows, batch, seed
+    Windows come epoch after epoch, each a permutation drawn from (seed, epoch); none is left out,
+    and a batch may straddle two epochs. A batch takes ``batch`` windows, or fewer where the next
+    one would exceed ``most`` particles. ``particles`` ``[n]`` counts those of each window.
+    """
+
+    def __init__(
+        self,
+        particles: NDArray[np.int64],
+        *,
+        batch: int,
+        most: int | None,
+        seed: int,
+        first: int,
+        last: int,
+    ) -> None:
+        self.particles, self.batch, self.seed = particles, batch, seed
+        self.most = np.inf if most is None else most
         self.first, self.last = first, last
 
     def __len__(self) -> int:
         return self.last - self.first
 
     def __iter__(self) -> Iterator[list[Key]]:
-        drawn_epoch, order = -1, np.empty(0, dtype=np.int64)
-        for step in range(self.first, self.last):
-            keys = []
-            for position in range(step * self.batch, (step + 1) * self.batch):
-                epoch, place = divmod(position, self.windows)
-                if epoch != drawn_epoch:
-                    order = np.random.default_rng([self.seed, epoch]).permutation(self.windows)
-                    drawn_epoch = epoch
-                keys.append((epoch, int(order[place])))
-            yield keys
+        return islice(self._batches(), self.first, self.last)
+
+    def _batches(self) -> Iterator[list[Key]]:
+        keys: list[Key] = []
+        total = 0
+        for epoch in count():
+            order = np.random.default_rng([self.seed, epoch]).permutation(len(self.particles))
+            for number in order.tolist():
+                size = int(self.particles[number])
+                if keys and (len(keys) == self.batch or total + size > self.most):
+                    yield keys
+                    keys, total = [], 0
+                keys.append((epoch, number))
+                total += size
 
 
-def training_batches(windows: Windows, config: TrainConfig, first: int, *, pin: bool) -> DataLoader[Sample]:
+def training_batches(
+    windows: Windows, config: TrainConfig, first: int, *, pin: bool
+) -> DataLoader[Sample]:
     """The batches of steps ``first`` to ``config.steps``, one :class:`Batch` each."""
+    keys = ShuffledKeys(
+        windows.particles,
+        batch=config.batch,
+        most=config.batch_particles,
+        seed=config.seed,
+        first=first,
+        last=config.steps,
+    )
     return DataLoader(
         windows,
-        batch_sampler=ShuffledKeys(len(windows), config.batch, config.seed, first, config.steps),
+        batch_sampler=keys,
         num_workers=config.workers,
         collate_fn=windows.collate,
         pin_memory=pin,

@@ -21,7 +21,9 @@ def command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "adaptgns.train", *map(str, arguments)]
 
 
-def test_smoke_run_reports_everything(drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_smoke_run_reports_everything(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "run"
     main(["--preset", "smoke", "--data", str(drops), "--out", str(out)])
     printed = capsys.readouterr().out

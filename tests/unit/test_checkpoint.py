@@ -27,9 +27,7 @@ from adaptgns.data.metadata import Metadata
 @pytest.fixture
 def checkpoint(small_config: TrainConfig, metadata: Metadata) -> Checkpoint:
     simulator = build_simulator(small_config, metadata)
-    return Checkpoint(
-        small_config, metadata, 7, 0.5, with_prefix("model", simulator.state_dict())
-    )
+    return Checkpoint(small_config, metadata, 7, 0.5, with_prefix("model", simulator.state_dict()))
 
 
 def test_round_trip(checkpoint: Checkpoint, tmp_path: Path) -> None:
@@ -92,7 +90,7 @@ def test_configuration_round_trip(small_config: TrainConfig) -> None:
 
 def test_unknown_keys_and_wrong_kinds_are_refused(small_config: TrainConfig) -> None:
     values = to_json(small_config)
-    with pytest.raises(ConfigError, match="config\\.json.*learning_rate"):
+    with pytest.raises(ConfigError, match=r"config\.json.*learning_rate"):
         from_json(TrainConfig, values | {"learning_rate": 1}, source="config.json")
     with pytest.raises(ConfigError, match="latents"):
         from_json(TrainConfig, values | {"model": {"latents": 3}}, source="x")

@@ -32,9 +32,9 @@ def trainer(drops: Path, folder: Path, config: TrainConfig, *, resume: bool = Fa
         config,
         read_metadata(drops),
         folder,
-        open_split(drops, "train"),
-        open_split(drops, "valid"),
-        read_checkpoint(folder / LAST) if resume else None,
+        train=open_split(drops, "train"),
+        valid=open_split(drops, "valid"),
+        checkpoint=read_checkpoint(folder / LAST) if resume else None,
     )
 
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.conftest import graph_of, random_windows
 
 from adaptgns.config import ModelConfig
 from adaptgns.data.metadata import Metadata
 from adaptgns.segment import Graph
 from adaptgns.simulator import Simulator
+from tests.conftest import graph_of, random_windows
 
 SMALL = ModelConfig(latent=16, hidden_layers=1, steps=3)
 
@@ -87,9 +87,7 @@ def test_permuting_particles_permutes_the_prediction(simulator: Simulator) -> No
     rng = np.random.default_rng(3)
     window, order = random_windows(rng, 40), torch.from_numpy(rng.permutation(40))
     plain = simulator(window, types(40), graph_of(window[:, -1].numpy(), 0.015))
-    permuted = simulator(
-        window[order], types(40), graph_of(window[order, -1].numpy(), 0.015)
-    )
+    permuted = simulator(window[order], types(40), graph_of(window[order, -1].numpy(), 0.015))
     torch.testing.assert_close(
         permuted.acceleration, plain.acceleration[order], rtol=1e-4, atol=1e-5
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 from adaptgns.config import TrainConfig
-from adaptgns.data.metadata import Metadata, read_metadata
+from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.simulator import Simulator
 from adaptgns.windows import Batch, ShuffledKeys, Windows, training_batches
@@ -22,12 +23,31 @@ def windows(drops: Path, small_config: TrainConfig) -> Windows:
     return Windows(open_split(drops, "train"), read_metadata(drops), small_config, noise=3e-4)
 
 
+def keys(first: int, last: int, most: int | None = None) -> list[list[tuple[int, int]]]:
+    particles = np.array([5, 9, 2, 4, 4, 1, 7])
+    batches = ShuffledKeys(particles, batch=3, most=most, seed=1, first=first, last=last)
+    assert len(batches) == last - first
+    return list(batches)
+
+
 def test_every_window_once_an_epoch_and_any_start_gives_the_same_order() -> None:
-    keys = list(ShuffledKeys(windows=7, batch=3, seed=1, first=0, last=7))
-    counts = Counter(key for batch in keys for key in batch)
+    batches = keys(0, 7)
+    counts = Counter(key for batch in batches for key in batch)
     assert counts == {(epoch, number): 1 for epoch in range(3) for number in range(7)}
-    assert list(ShuffledKeys(windows=7, batch=3, seed=1, first=4, last=7)) == keys[4:]
-    assert [n for _, n in sum(keys, [])][:7] != [n for _, n in sum(keys, [])][7:14]
+    assert keys(4, 7) == batches[4:]
+    order = [number for batch in batches for _, number in batch]
+    assert order[:7] != order[7:14]
+
+
+def test_batches_keep_to_their_particles() -> None:
+    particles = [5, 9, 2, 4, 4, 1, 7]
+    batches = keys(0, 12, most=8)
+    assert keys(5, 12, most=8) == batches[5:]
+    sizes = [[particles[number] for _, number in batch] for batch in batches]
+    assert all(len(batch) == 1 or sum(batch) <= 8 for batch in sizes)
+    assert {len(batch) for batch in sizes} == {1, 2, 3}
+    for batch, following in itertools.pairwise(sizes):
+        assert len(batch) == 3 or sum(batch) + following[0] > 8
 
 
 def test_samples_depend_on_seed_epoch_and_number_alone(windows: Windows) -> None:
@@ -38,7 +58,9 @@ def test_samples_depend_on_seed_epoch_and_number_alone(windows: Windows) -> None
 
 def test_noise_moves_the_following_position_with_the_last(windows: Windows) -> None:
     noisy = windows[0, 5].positions
-    clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)[0, 5].positions
+    clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)[
+        0, 5
+    ].positions
     noise = noisy - clean
     assert (noise[0] == 0).all()
     assert np.abs(noise[1:]).min() > 0
@@ -46,9 +68,7 @@ def test_noise_moves_the_following_position_with_the_last(windows: Windows) -> N
 
 
 def test_target_undoes_the_noise_of_the_last_velocity(windows: Windows) -> None:
-    simulator = Simulator(
-        windows.config.model, windows.metadata, noise=3e-4, variance=True
-    )
+    simulator = Simulator(windows.config.model, windows.metadata, noise=3e-4, variance=True)
     batch = windows.collate([windows[0, 5]])
     advanced = simulator.advance(batch.window, simulator.target(batch.window, batch.following))
     clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
@@ -86,7 +106,9 @@ def test_batches_join_unequal_samples_without_edges_between(windows: Windows) ->
     assert batch.ptr.tolist() == [0, first, len(batch.particle_type)]
     assert batch.graph is not None
     assert ((batch.graph.senders < first) == (batch.graph.receivers < first)).all()
-    distance = (batch.window[batch.graph.senders, -1] - batch.window[batch.graph.receivers, -1]).norm(dim=1)
+    distance = (
+        batch.window[batch.graph.senders, -1] - batch.window[batch.graph.receivers, -1]
+    ).norm(dim=1)
     assert distance.max() <= windows.metadata.radius * (1 + 1e-5)
 
 
