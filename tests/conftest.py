@@ -72,6 +72,9 @@ def drops(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+torch.set_num_threads(1)
+
+
 def graph_of(positions: np.ndarray, radius: float, *, self_edges: bool = True) -> Graph:
     """The radius graph of ``positions`` ``[N, d]`` as the network takes it."""
     edges = _core.radius_graph(positions, radius, self_edges=self_edges, return_offsets=True)
