@@ -1,5 +1,7 @@
 //! The background grid: quadratic B-splines on the nodes of a box.
 
+use std::ops::Range;
+
 /// Nodes beyond each wall that the splines of a particle inside the box can reach.
 const PADDING: usize = 1;
 /// Nodes one spline overlaps along one axis.
@@ -23,6 +25,13 @@ pub(crate) struct Node<const D: usize> {
     pub velocity: [f64; D],
 }
 
+impl<const D: usize> Node<D> {
+    const EMPTY: Self = Self {
+        mass: 0.0,
+        velocity: [0.0; D],
+    };
+}
+
 /// The nodes around a particle: index, spline weight, and vector from the particle.
 pub(crate) struct Stencil<const D: usize> {
     pub nodes: [usize; MAX_STENCIL],
@@ -38,11 +47,11 @@ pub(crate) struct Grid<const D: usize> {
     pub nodes: Vec<Node<D>>,
     pub spacing: f64,
     walls: Walls,
-    cells: usize,
     strides: [usize; D],
-    /// Node indices along each axis, first and one past the last, outside of which all
-    /// nodes are empty.
-    active: [(usize, usize); D],
+    /// Where a node is along an axis: -1 or 1 on the low or high wall or beyond, else 0.
+    sides: Vec<f64>,
+    /// Node indices along each axis outside of which all nodes are empty.
+    active: [Range<usize>; D],
 }
 
 impl<const D: usize> Grid<D> {
@@ -53,17 +62,15 @@ impl<const D: usize> Grid<D> {
         let spacing = extent / cells as f64;
         let side = cells + 1 + 2 * PADDING;
         let strides = std::array::from_fn(|axis| side.pow((D - 1 - axis) as u32));
-        let empty = Node {
-            mass: 0.0,
-            velocity: [0.0; D],
-        };
+        let sides = (0..side)
+            .map(|index| f64::from(index >= cells + PADDING) - f64::from(index <= PADDING));
         Self {
-            nodes: vec![empty; side.pow(D as u32)],
+            nodes: vec![Node::EMPTY; side.pow(D as u32)],
             spacing,
             walls,
-            cells,
             strides,
-            active: [(0, side); D],
+            sides: sides.collect(),
+            active: std::array::from_fn(|_| 0..0),
         }
     }
 
@@ -109,12 +116,7 @@ impl<const D: usize> Grid<D> {
 
     /// Empties the nodes in use and takes into use those around `positions`.
     pub(crate) fn cover<'a>(&mut self, positions: impl Iterator<Item = &'a [f64; D]>) {
-        self.for_each_row(|row, _| {
-            row.fill(Node {
-                mass: 0.0,
-                velocity: [0.0; D],
-            });
-        });
+        self.for_each_node(|node, _| *node = Node::EMPTY);
         let (mut low, mut high) = ([f64::INFINITY; D], [f64::NEG_INFINITY; D]);
         for position in positions {
             for axis in 0..D {
@@ -122,9 +124,8 @@ impl<const D: usize> Grid<D> {
                 high[axis] = high[axis].max(position[axis]);
             }
         }
-        self.active = std::array::from_fn(|axis| {
-            (self.locate(low[axis]).0, self.locate(high[axis]).0 + REACH)
-        });
+        self.active =
+            std::array::from_fn(|axis| self.locate(low[axis]).0..self.locate(high[axis]).0 + REACH);
     }
 
     /// First node of the spline around a coordinate, and the coordinate's distance from
@@ -135,42 +136,31 @@ impl<const D: usize> Grid<D> {
         (first, x - first as f64)
     }
 
-    /// Calls `visit` for each run of used nodes along the last axis with the indices of
-    /// its first node.
-    pub(crate) fn for_each_row(&mut self, mut visit: impl FnMut(&mut [Node<D>], [usize; D])) {
-        let mut index = std::array::from_fn(|axis| self.active[axis].0);
-        let length = self.active[D - 1].1 - self.active[D - 1].0;
-        loop {
-            let start: usize = (0..D).map(|axis| index[axis] * self.strides[axis]).sum();
-            visit(&mut self.nodes[start..start + length], index);
-            let mut axis = D - 1;
-            loop {
-                if axis == 0 {
-                    return;
-                }
-                axis -= 1;
-                index[axis] += 1;
-                if index[axis] < self.active[axis].1 {
-                    break;
-                }
-                index[axis] = self.active[axis].0;
-            }
+    /// Calls `visit` for each node in use with its place along each axis: -1 or 1 on the
+    /// low or high wall or beyond, 0 between.
+    pub(crate) fn for_each_node(&mut self, mut visit: impl FnMut(&mut Node<D>, [f64; D])) {
+        if self.active.iter().any(Range::is_empty) {
+            return;
         }
-    }
-
-    /// Nodes along one axis.
-    pub(crate) fn side(&self) -> usize {
-        self.cells + 1 + 2 * PADDING
-    }
-
-    /// Outward sign (-1 or 1) if the node lies on a wall of this axis or beyond, else 0.
-    pub(crate) fn wall_side(&self, index: usize) -> f64 {
-        if index <= PADDING {
-            -1.0
-        } else if index >= self.cells + PADDING {
-            1.0
-        } else {
-            0.0
+        let last = self.active[D - 1].clone();
+        let mut index: [usize; D] = std::array::from_fn(|axis| self.active[axis].start);
+        loop {
+            let row: usize = (0..D - 1)
+                .map(|axis| index[axis] * self.strides[axis])
+                .sum();
+            let mut sides = index.map(|along| self.sides[along]);
+            for along in last.clone() {
+                sides[D - 1] = self.sides[along];
+                visit(&mut self.nodes[row + along], sides);
+            }
+            let Some(axis) = (0..D - 1).rfind(|&axis| index[axis] + 1 < self.active[axis].end)
+            else {
+                return;
+            };
+            index[axis] += 1;
+            for later in axis + 1..D - 1 {
+                index[later] = self.active[later].start;
+            }
         }
     }
 }

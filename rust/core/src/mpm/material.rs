@@ -22,8 +22,12 @@ pub enum Contact {
     Friction(f64),
 }
 
-/// Tait's equation of state p = c²/γ ((ρ/ρ₀)^γ − 1), with little tension and a Newtonian
-/// viscosity.
+/// Tait's equation of state p = c²/γ ((ρ/ρ₀)^γ − 1) with a Newtonian viscosity.
+///
+/// The density follows the divergence of the velocity. Measured on the grid instead it
+/// would need no memory, but it would also carry the noise of the particles' arrangement
+/// relative to the grid, of several per cent where one per cent is c²/100 of pressure:
+/// drops then burst in free fall, or heat up without end if tension holds them together.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Water {
     /// Speed of sound at rest density \[m/s\].
@@ -32,10 +36,9 @@ pub struct Water {
     pub exponent: f64,
     /// Kinematic viscosity \[m²/s\].
     pub viscosity: f64,
-    /// Largest expansion, as a logarithm of volume, up to which water holds together.
+    /// Largest expansion that water resists and remembers, as a logarithm of volume.
+    /// What is torn further apart is spray, at rest density when it meets water again.
     pub cohesion: f64,
-    /// x
-    pub torn: f64,
 }
 
 /// Drucker–Prager plasticity on Hencky strains (Klár et al. 2016, section 6).
@@ -49,6 +52,10 @@ pub struct Sand {
     pub friction_angle: f64,
     /// Friction coefficient at the walls.
     pub wall_friction: f64,
+    /// Time \[s\] whose product with the divergence of the velocity is the part of the
+    /// pressure lost in expansion and added in compression, a bulk viscosity: colliding
+    /// grains don't bounce, while the elastic continuum of Klár et al. would.
+    pub collision_time: f64,
 }
 
 /// What a material remembers of a particle's past.
@@ -123,10 +130,9 @@ impl Water {
         dt: f64,
     ) -> Matrix<D> {
         let divergence = linalg::trace(velocity_gradient);
-        history.log_volume = (history.log_volume + dt * divergence).min(self.torn);
-        let log_volume = history.log_volume.min(self.cohesion);
+        history.log_volume = (history.log_volume + dt * divergence).min(self.cohesion);
         let modulus = self.sound_speed.powi(2) / self.exponent;
-        let pressure = modulus * ((-self.exponent * log_volume).exp() - 1.0);
+        let pressure = modulus * ((-self.exponent * history.log_volume).exp() - 1.0);
         // Kirchhoff stress is Cauchy stress times the volume ratio.
         let volume = history.log_volume.exp();
         let mut stress = linalg::zero();
@@ -142,13 +148,10 @@ impl Water {
 
     /// −∫ p dV from rest.
     fn energy(&self, log_volume: f64) -> f64 {
-        let held = log_volume.min(self.cohesion);
         let modulus = self.sound_speed.powi(2) / self.exponent;
-        let compression = ((1.0 - self.exponent) * held).exp() - 1.0;
-        let tension = 1.0 - (-self.exponent * self.cohesion).exp();
-        modulus
-            * (compression / (self.exponent - 1.0) + held.exp() - 1.0
-                + tension * (log_volume.exp() - held.exp()))
+        let pressure_work =
+            (((1.0 - self.exponent) * log_volume).exp() - 1.0) / (self.exponent - 1.0);
+        modulus * (pressure_work + log_volume.exp() - 1.0)
     }
 }
 
@@ -172,10 +175,11 @@ impl Sand {
         history.left_cauchy_green =
             linalg::congruence(&axes, &linalg::diagonal(&strain.map(|e| (2.0 * e).exp())));
         let volumetric: f64 = self.lambda * strain.iter().sum::<f64>();
-        linalg::congruence(
-            &axes,
-            &linalg::diagonal(&strain.map(|e| volumetric + 2.0 * self.mu * e)),
-        )
+        let kirchhoff = strain.map(|e| volumetric + 2.0 * self.mu * e);
+        let mean = kirchhoff.iter().sum::<f64>() / D as f64;
+        let damping =
+            -mean * (self.collision_time * linalg::trace(velocity_gradient)).clamp(-1.0, 1.0);
+        linalg::congruence(&axes, &linalg::diagonal(&kirchhoff.map(|s| s + damping)))
     }
 
     /// Return mapping of principal Hencky strains to the Drucker–Prager cone: what

@@ -10,6 +10,7 @@ mod linalg;
 mod material;
 mod rng;
 mod scene;
+mod separation;
 mod solver;
 
 pub use grid::Walls;

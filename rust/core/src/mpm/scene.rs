@@ -17,6 +17,10 @@ const MIN_PARTICLES: usize = 16;
 const MAX_FILL: f64 = 0.5;
 /// Tries at placing blocks apart before settling for a single one.
 const MAX_TRIES: usize = 100;
+/// Distance of grid nodes over distance of particles.
+const COARSENESS: f64 = 2.0;
+/// Largest offset of a particle from its lattice point, in spacings.
+const JITTER: f64 = 0.45;
 
 /// A family of random scenes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,18 +37,16 @@ struct Recipe {
     particle_type: i64,
     /// Distance of particles \[m\], in 2D and 3D.
     spacing: [f64; 2],
-    /// Distance of grid nodes over distance of particles.
-    coarseness: f64,
-    /// Largest offset from the lattice, in spacings.
-    jitter: f64,
     /// Range of the number of particles, in 2D and 3D.
     particles: [(usize, usize); 2],
     /// Probability of one block, two blocks, ...
     blocks: &'static [f64],
     /// Largest side over smallest.
     aspect: f64,
-    /// Largest velocity along each axis \[m/s\].
-    speed: f64,
+    /// Range of the horizontal velocities \[m/s\].
+    sideways: (f64, f64),
+    /// Range of the vertical velocity \[m/s\].
+    upwards: (f64, f64),
 }
 
 struct Block<const D: usize> {
@@ -114,56 +116,54 @@ impl Scene {
         let blocks = draw_blocks::<D>(&mut rng, &recipe, count);
         let particles: Vec<_> = blocks
             .iter()
-            .flat_map(|block| fill(&mut rng, block, spacing, recipe.jitter))
+            .flat_map(|block| fill(&mut rng, block, spacing))
             .collect();
-        Ok(Simulation::new(
+        let mut simulation = Simulation::new(
             recipe.material,
             WALLS,
             spacing,
-            recipe.coarseness * spacing,
+            COARSENESS * spacing,
             particles,
-        ))
+        )?;
+        // Otherwise the pairs that the jitter brought together would part in flight.
+        simulation.separate_fully();
+        Ok(simulation)
     }
 
+    /// Chosen so that 30 scenes have the published statistics of their counterparts
+    /// (`benchmarks/generate.py` compares them).
     fn recipe(self) -> Recipe {
-        let knob = |name: &str, default: f64| -> f64 {
-            std::env::var(name)
-                .ok()
-                .map_or(default, |v| v.parse().unwrap())
-        };
         match self {
             Self::WaterDrop => Recipe {
                 material: Material::Water(Water {
-                    sound_speed: knob("C", 14.0),
+                    sound_speed: 14.0,
                     exponent: 7.0,
-                    viscosity: knob("VISC", 0.003),
-                    cohesion: knob("TENS", 0.01),
-                    torn: knob("TORN", 0.5),
+                    viscosity: 0.003,
+                    cohesion: 0.05,
                 }),
                 particle_type: 5,
-                spacing: [knob("SP", 0.0102), 0.025],
-                coarseness: knob("COARSE", 1.9),
-                jitter: knob("JIT", 0.45),
+                spacing: [0.0102, 0.025],
                 particles: [(220, 914), (1000, 6000)],
                 blocks: &[0.8, 0.2],
                 aspect: 1.6,
-                speed: knob("SPEED", 0.5),
+                sideways: (-0.5, 0.5),
+                upwards: (-0.5, 0.5),
             },
             Self::Sand => Recipe {
                 material: Material::Sand(Sand {
-                    lambda: knob("LAM", 350.0),
-                    mu: knob("MU", 230.0),
-                    friction_angle: knob("PHI", 40.0_f64).to_radians(),
-                    wall_friction: knob("WF", 0.4),
+                    lambda: 350.0,
+                    mu: 230.0,
+                    friction_angle: 35.0_f64.to_radians(),
+                    wall_friction: 0.4,
+                    collision_time: 0.01,
                 }),
                 particle_type: 6,
-                spacing: [knob("SP", 0.0098), 0.025],
-                coarseness: knob("COARSE", 2.0),
-                jitter: knob("JIT", 0.45),
+                spacing: [0.009, 0.025],
                 particles: [(400, 2140), (2000, 8000)],
                 blocks: &[0.4, 0.3, 0.3],
                 aspect: 2.0,
-                speed: knob("SPEED", 2.0),
+                sideways: (-3.0, 3.0),
+                upwards: (-3.5, 0.5),
             },
         }
     }
@@ -241,7 +241,14 @@ fn draw_block<const D: usize>(rng: &mut Rng, recipe: &Recipe, particles: usize) 
         let room = (WALLS.high - WALLS.low - spacing - length).max(0.0);
         WALLS.low + 0.5 * spacing + rng.uniform(0.0, room)
     });
-    let velocity = std::array::from_fn(|_| rng.uniform(-recipe.speed, recipe.speed));
+    let velocity = std::array::from_fn(|axis| {
+        let (low, high) = if axis == 1 {
+            recipe.upwards
+        } else {
+            recipe.sideways
+        };
+        rng.uniform(low, high)
+    });
     Block {
         low,
         size,
@@ -251,12 +258,11 @@ fn draw_block<const D: usize>(rng: &mut Rng, recipe: &Recipe, particles: usize) 
 }
 
 /// Positions and velocities of a block's particles, on a lattice of rows along the first
-/// axis, each moved at random by up to `jitter` spacings.
+/// axis, each moved at random by up to [`JITTER`] spacings.
 fn fill<const D: usize>(
     rng: &mut Rng,
     block: &Block<D>,
     spacing: f64,
-    jitter: f64,
 ) -> Vec<([f64; D], [f64; D])> {
     let across: [usize; D] = block.size.map(|length| (length / spacing).round() as usize);
     let rows: usize = across[1..].iter().product();
@@ -275,7 +281,7 @@ fn fill<const D: usize>(
                     remainder /= across[axis];
                     spacing * (step as f64 + 0.5)
                 };
-                block.low[axis] + lattice + spacing * rng.uniform(-jitter, jitter)
+                block.low[axis] + lattice + spacing * rng.uniform(-JITTER, JITTER)
             });
             particles.push((position, block.velocity));
         }

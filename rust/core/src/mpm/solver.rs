@@ -3,6 +3,8 @@
 use super::grid::{Grid, Stencil, Walls};
 use super::linalg::{self, Matrix};
 use super::material::{Contact, History, Material};
+use super::separation::Separation;
+use crate::Error;
 
 /// Standard gravity, along the second axis \[m/s²\].
 pub const GRAVITY: f64 = 9.81;
@@ -13,6 +15,9 @@ const COURANT: f64 = 0.4;
 /// Distance that particles keep from the walls, in grid spacings: small against their
 /// own distance, large against the rounding of a position to single precision.
 const WALL_MARGIN: f64 = 0.05;
+/// Part of what a close pair lacks in distance that is made up in one frame: slow enough
+/// to add nothing visible to the accelerations.
+const SEPARATION_RATE: f64 = 0.1;
 
 #[derive(Clone)]
 struct Particle<const D: usize> {
@@ -33,6 +38,7 @@ pub struct Simulation<const D: usize> {
     particles: Vec<Particle<D>>,
     material: Material,
     grid: Grid<D>,
+    separation: Separation<D>,
     walls: Walls,
     particle_mass: f64,
     /// Length of the last step \[s\].
@@ -43,15 +49,41 @@ impl<const D: usize> Simulation<D> {
     /// Particles of equal mass, at rest density when `particle_spacing` apart on a
     /// square lattice, on a grid of about `grid_spacing`. Positions outside the walls
     /// are moved to them.
+    ///
+    /// # Errors
+    ///
+    /// If a length is not positive and finite, or a position or velocity not finite.
     pub fn new(
         material: Material,
         walls: Walls,
         particle_spacing: f64,
         grid_spacing: f64,
         particles: impl IntoIterator<Item = ([f64; D], [f64; D])>,
-    ) -> Self {
+    ) -> Result<Self, Error> {
         const {
             assert!(D == 2 || D == 3);
+        }
+        let positive = [
+            ("walls", walls.high - walls.low),
+            ("particle_spacing", particle_spacing),
+            ("grid_spacing", grid_spacing),
+        ];
+        for (argument, length) in positive {
+            if !(length > 0.0 && length.is_finite()) {
+                return Err(Error::invalid(
+                    argument,
+                    format!("got a length of {length}, accepted are positive ones"),
+                ));
+            }
+        }
+        let particles: Vec<_> = particles.into_iter().collect();
+        for (position, velocity) in &particles {
+            if !position.iter().chain(velocity).all(|x| x.is_finite()) {
+                return Err(Error::invalid(
+                    "particles",
+                    format!("got {position:?} moving at {velocity:?}, accepted are finite numbers"),
+                ));
+            }
         }
         let particles = particles
             .into_iter()
@@ -66,12 +98,13 @@ impl<const D: usize> Simulation<D> {
             particles,
             material,
             grid: Grid::new(walls, grid_spacing),
+            separation: Separation::new(walls, particle_spacing),
             walls,
             particle_mass: particle_spacing.powi(D as i32),
             step: 0.0,
         };
         simulation.keep_inside();
-        simulation
+        Ok(simulation)
     }
 
     /// Advances by [`FRAME_TIME`].
@@ -82,11 +115,12 @@ impl<const D: usize> Simulation<D> {
             sound = sound.max(self.material.sound_speed(&particle.history));
         }
         let speed = fastest.sqrt() + sound;
-        let steps = (FRAME_TIME * speed / (COURANT * self.grid.spacing)).ceil();
+        let steps = (FRAME_TIME * speed / (COURANT * self.grid.spacing)).ceil().max(1.0);
         self.change_step(FRAME_TIME / steps);
         for _ in 0..steps as usize {
             self.advance_step();
         }
+        self.separate(SEPARATION_RATE);
     }
 
     /// Positions in the order of construction \[m\].
@@ -188,26 +222,20 @@ impl<const D: usize> Simulation<D> {
     fn update_grid(&mut self) {
         let kick = -GRAVITY * self.step;
         let contact = self.material.contact();
-        let sides: Vec<f64> = (0..self.grid.side())
-            .map(|index| self.grid.wall_side(index))
-            .collect();
-        self.grid.for_each_row(|row, first| {
-            for (along, node) in row.iter_mut().enumerate() {
-                if node.mass == 0.0 {
-                    continue;
-                }
-                for axis in 0..D {
-                    node.velocity[axis] /= node.mass;
-                }
-                node.velocity[1] += kick;
-                for axis in 0..D {
-                    let index = first[axis] + if axis == D - 1 { along } else { 0 };
-                    let into = sides[index] * node.velocity[axis];
-                    if into > 0.0 {
-                        node.velocity[axis] = 0.0;
-                        if let Contact::Friction(coefficient) = contact {
-                            slow(&mut node.velocity, axis, coefficient * into);
-                        }
+        self.grid.for_each_node(|node, sides| {
+            if node.mass == 0.0 {
+                return;
+            }
+            for component in &mut node.velocity {
+                *component /= node.mass;
+            }
+            node.velocity[1] += kick;
+            for axis in 0..D {
+                let into = sides[axis] * node.velocity[axis];
+                if into > 0.0 {
+                    node.velocity[axis] = 0.0;
+                    if let Contact::Friction(coefficient) = contact {
+                        slow(&mut node.velocity, axis, coefficient * into);
                     }
                 }
             }
@@ -235,6 +263,26 @@ impl<const D: usize> Simulation<D> {
             for axis in 0..D {
                 particle.position[axis] += self.step * velocity[axis];
             }
+        }
+    }
+
+    /// Moves particles that are too close apart, by the part `strength` of what they lack.
+    fn separate(&mut self, strength: f64) {
+        let positions: Vec<_> = self.positions().copied().collect();
+        let shifts = self.separation.shifts(&positions, strength);
+        for (particle, shift) in self.particles.iter_mut().zip(shifts) {
+            for axis in 0..D {
+                particle.position[axis] += shift[axis];
+            }
+        }
+        self.keep_inside();
+    }
+
+    /// Moves the particles until hardly a pair is too close.
+    pub(crate) fn separate_fully(&mut self) {
+        const ROUNDS: usize = 30;
+        for _ in 0..ROUNDS {
+            self.separate(0.5);
         }
     }
 
