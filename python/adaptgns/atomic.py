@@ -4,8 +4,26 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+
+def publish(partial: Path, final: Path) -> None:
+    """Give a finished file its name, after its bytes have reached the disk.
+
+    Raises OSError where the disk is full or the folder cannot be written.
+    """
+    with partial.open("rb+") as file:
+        os.fsync(file.fileno())
+    partial.replace(final)
+    # The rename itself survives a power cut only once the folder is on disk; not every system
+    # lets a folder be opened for that.
+    with suppress(OSError):
+        folder = os.open(final.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
 
 
 @contextmanager
@@ -21,8 +39,12 @@ def written_whole(path: Path) -> Iterator[Path]:
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
-        with partial.open("rb+") as file:
-            os.fsync(file.fileno())
-        partial.replace(path)
+        publish(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write ``text`` to ``path``, replacing what is there only once all of it is on disk."""
+    with written_whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")

@@ -12,7 +12,7 @@ import torch
 import tyro
 from rich.console import Console
 
-from adaptgns.atomic import written_whole
+from adaptgns.atomic import replace_text
 from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint
 from adaptgns.config import PolicyName, RolloutConfig, TrainConfig, from_json, to_json
 from adaptgns.data.check import check_split
@@ -85,8 +85,7 @@ def train(config: TrainConfig, console: Console) -> Path:
     data = dataset_folder(config.data)
     metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
     folder.mkdir(parents=True, exist_ok=True)
-    with written_whole(folder / CONFIG) as partial:
-        partial.write_text(json.dumps(to_json(config), indent=1))
+    replace_text(folder / CONFIG, json.dumps(to_json(config), indent=1))
     train_split, valid_split = open_split(data, "train"), open_split(data, "valid")
     check_split(train_split, metadata)
     trainer = Trainer(

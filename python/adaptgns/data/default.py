@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from adaptgns import _core
-from adaptgns.data.atomic import replace_text
+from adaptgns.atomic import replace_text
 from adaptgns.data.errors import DataError
 from adaptgns.data.generation import SplitPlan, generate_dataset
 from adaptgns.data.scenes import SCENES, SceneName

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from adaptgns.data.atomic import replace_text
+from adaptgns.atomic import replace_text
 from adaptgns.data.errors import DataError, DataWarning
 from adaptgns.data.statistics import FILE_KEYS, MotionStatistics, compute_statistics
 from adaptgns.data.trajectories import SPLITS, find_split, open_split

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import h5py
 
-from adaptgns.data.atomic import publish
+from adaptgns.atomic import publish
 from adaptgns.data.errors import DataError
 from adaptgns.data.trajectory import (
     Shape,
