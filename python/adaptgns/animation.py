@@ -70,7 +70,7 @@ class Animation:
             )
         self._sigma = rollout.sigma
         self._extra_edges = file.policy == "adaptive" and self._sigma is not None
-        self._mobile = file.mobile(rollout.particle_type)
+        self._mobile = file.metadata.mobile(rollout.particle_type)
         self._steps = rollout.steps
         self.shown: Sequence[int] = sorted({*range(every - 1, self._steps, every), self._steps - 1})
         """Rows of the rollout that are drawn"""

@@ -1,8 +1,8 @@
 """Checkpoints: one safetensors file each, written whole or not at all.
 
 The file's header holds the run's configuration and the data's metadata as JSON, enough to rebuild
-the simulator with nothing else. Tensors: ``model.*``; ``average.*``, the moving average of the
-weights where the run keeps one; ``optimizer.*`` in the files that training goes on from.
+the simulator with nothing else. Tensors: ``model.*``, and ``optimizer.*`` in the files that
+training goes on from.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class Checkpoint:
         return {k.removeprefix(prefix): v for k, v in self.tensors.items() if k.startswith(prefix)}
 
     def simulator(self) -> Simulator:
-        """The simulator with the weights to be used: their average where there is one."""
+        """The trained simulator."""
         simulator = build_simulator(self.config, self.metadata)
-        simulator.load_state_dict(self.group("average") or self.group("model"))
+        simulator.load_state_dict(self.group("model"))
         return simulator.eval()
 
 

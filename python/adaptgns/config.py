@@ -120,13 +120,8 @@ class TrainConfig:
     """Steps of linear increase of the learning rate from zero."""
     clip: float | None = None
     """Largest gradient norm; None: unlimited."""
-    average: float = 0.0
-    """Decay per step of the weights' exponential moving average that is evaluated and kept;
-    0: the weights themselves."""
     noise: float = 6.7e-4
     """Std of the random-walk noise on the last input velocity (length per frame)."""
-    noise_spread: float = 1.0
-    """Draw each sample's noise std log-uniformly between noise and this many times it."""
     position_correction: float = 0.0
     """Share of the last position's noise that the target undoes in one frame; 0: none, as GNS."""
     mirror: bool = False

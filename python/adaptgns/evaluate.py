@@ -137,7 +137,7 @@ class Truth:
     @classmethod
     def of(cls, rollout: Rollout, file: RolloutFile) -> Truth:
         """Of the trajectory that ``rollout`` predicts."""
-        mobile = file.mobile(rollout.particle_type)
+        mobile = file.metadata.mobile(rollout.particle_type)
         if not mobile.any():
             raise ValueError(
                 f"rollouts: trajectory {rollout.name} of {file.path} has kinematic particles only, "

@@ -35,15 +35,14 @@ from adaptgns.checkpoint import (
     with_prefix,
     write_checkpoint,
 )
-from adaptgns.config import HISTORY, TrainConfig, torch_device
+from adaptgns.config import TrainConfig, torch_device
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
 from adaptgns.losses import training_loss
-from adaptgns.policies import Edges, Fixed, State
-from adaptgns.rollout import steps as rollout_steps
+from adaptgns.policies import Edges, State
 from adaptgns.rollout import to_sigma
 from adaptgns.segment import Graph
-from adaptgns.simulator import Simulator
+from adaptgns.validation import validate
 from adaptgns.windows import Batch, Windows, training_batches
 
 LOG_EVERY = 100
@@ -55,7 +54,7 @@ class TrainingStopped(Exception):  # noqa: N818 (not an error: nothing is lost)
 
 
 class Trainer:
-    """A run: its simulator, optimizer and averaged weights, and the step they are at."""
+    """A run: its simulator and optimizer, and the step they are at."""
 
     def __init__(
         self,
@@ -72,13 +71,10 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.simulator = build_simulator(config, metadata).to(self.device)
         self.optimizer = torch.optim.Adam(self.simulator.parameters(), fused=True)
-        self.average: dict[str, Tensor] = {}
         self.step = 0
         self.best_score = math.inf
         if checkpoint is not None:
             self._restore(checkpoint)
-        elif config.average:
-            self.average = {k: v.clone() for k, v in self.simulator.state_dict().items()}
         self.windows = Windows(train, metadata, config, noise=config.noise)
         if not len(self.windows):
             raise ValueError(
@@ -87,7 +83,6 @@ class Trainer:
 
     def _restore(self, checkpoint: Checkpoint) -> None:
         self.simulator.load_state_dict(checkpoint.group("model"))
-        self.average = {k: v.to(self.device) for k, v in checkpoint.group("average").items()}
         state: dict[int, dict[str, Tensor]] = {}
         for name, tensor in checkpoint.group("optimizer").items():
             index, key = name.split(".")
@@ -99,9 +94,6 @@ class Trainer:
     def checkpoint(self, *, resumable: bool) -> Checkpoint:
         """The run as it stands; ``resumable`` with all that training needs to go on."""
         tensors = with_prefix("model", self.simulator.state_dict())
-        if self.average:
-            averaged = with_prefix("average", self.average)
-            tensors = {**tensors, **averaged} if resumable else averaged
         if resumable:
             for index, state in self.optimizer.state_dict()["state"].items():
                 tensors |= with_prefix(f"optimizer.{index}", state)
@@ -182,12 +174,6 @@ class Trainer:
         if self.config.clip is not None:
             torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), self.config.clip)
         self.optimizer.step()
-        if self.average:
-            with torch.no_grad():
-                # Short memory at first: the initial weights should not linger.
-                decay = min(self.config.average, (1 + self.step) / (10 + self.step))
-                for name, weights in self.simulator.state_dict().items():
-                    self.average[name].lerp_(weights, 1 - decay)
         return loss.detach()
 
     def learning_rate(self) -> float:
@@ -245,48 +231,15 @@ class Trainer:
             )
         return mean
 
-    def evaluated(self) -> Simulator:
-        """The simulator that rollouts use: the averaged weights where the run keeps them."""
-        return self.checkpoint(resumable=False).simulator().to(self.device)
-
     def _validate(self, log: Log) -> None:
         assert self.valid is not None
-        scores = validate(self.evaluated(), self.valid, self.config)
+        self.simulator.eval()
+        scores = validate(self.simulator, self.valid, self.config)
+        self.simulator.train()
         log.write(self.step, scores)
         if scores["valid_rollout_mse"] < self.best_score:
             self.best_score = scores["valid_rollout_mse"]
             write_checkpoint(self.folder / BEST, self.checkpoint(resumable=False))
-
-
-def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> dict[str, float]:
-    """One-step and rollout errors on the first validation trajectories, on the base graph.
-
-    ``valid_rollout_mse`` is the mean over steps, particles and dimensions of the squared position
-    error; ``valid_one_step`` the squared error of the normalized acceleration, summed over
-    dimensions, on true inputs at every tenth frame of the first trajectories.
-    """
-    curves, one_step = [], []
-    for index in range(min(len(valid), config.validate_trajectories)):
-        trajectory = valid[index]
-        true = trajectory.positions[HISTORY:]
-        count = min(config.validate_horizon, len(true))
-        mobile = ~np.isin(trajectory.particle_type, simulator.metadata.kinematic_types)
-        rolled = list(rollout_steps(simulator, trajectory, Fixed(), count))
-        box = simulator.metadata.box
-        error = np.stack([s.positions for s in rolled]) - true[:count]
-        if box is not None:
-            periodic = np.isfinite(box)
-            error[..., periodic] -= box[periodic] * np.round(error[..., periodic] / box[periodic])
-        curves.append(np.square(error[:, mobile], dtype=np.float64).mean((1, 2)))
-        one_step.append(rolled[0].squared_error[mobile].mean(dtype=np.float64))
-    shortest = min(map(len, curves))
-    curve = np.mean([c[:shortest] for c in curves], axis=0)
-    scores = {f"valid_mse_{k}": float(curve[k - 1]) for k in (50, 100, 200) if k <= shortest}
-    return {
-        "valid_rollout_mse": float(curve.mean()),
-        "valid_one_step": float(np.mean(one_step)),
-        **scores,
-    }
 
 
 class Log:

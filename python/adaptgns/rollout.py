@@ -68,7 +68,7 @@ def steps(
     particle_type = torch.from_numpy(trajectory.particle_type).to(device)
     given = trajectory.material_property
     material = None if given is None else torch.from_numpy(given).to(device)
-    mobile = ~np.isin(trajectory.particle_type, simulator.metadata.kinematic_types)
+    mobile = simulator.metadata.mobile(trajectory.particle_type)
     kinematic = torch.from_numpy(~mobile).to(device)
     window = true[:HISTORY].transpose(0, 1).contiguous()  # [N, H, d]
     sigma: NDArray[np.float32] | None = None

@@ -328,10 +328,6 @@ class RolloutFile:
         """How many times farther it sees."""
         return float(self.settings["adaptive"]["factor"])
 
-    def mobile(self, particle_type: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """``[N]``, the non-kinematic among particles of the given types."""
-        return ~np.isin(particle_type, self.metadata.kinematic_types)
-
 
 def _create(group: h5py.Group, name: str, values: ArrayLike) -> None:
     tensor = CATALOGUE[name]

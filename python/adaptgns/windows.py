@@ -109,22 +109,18 @@ class Windows(Dataset[Sample]):
         start = int(number - self.starts[trajectory])
         window = self.trajectories.window(trajectory, start, start + self.frames)
         positions = window.positions
-        mobile = self.mobile(window.particle_type)
+        mobile = self.metadata.mobile(window.particle_type)
         if self.config.mirror and rng.random() < 0.5:
             positions[..., 0] = np.float32(sum(self.metadata.bounds[0])) - positions[..., 0]
-        std = self.noise * self.config.noise_spread ** rng.random()
-        if std > 0:
-            walk = random_walk_noise(rng, HISTORY, positions.shape[1], positions.shape[2], std)
+        if self.noise > 0:
+            _, particles, dim = positions.shape
+            walk = random_walk_noise(rng, HISTORY, particles, dim, self.noise)
             walk *= mobile[:, None]
             positions[-HISTORY - 1 : -1] += walk
             # The following position moves along, so that the target undoes the noise of the last
             # velocity and of that of the last position only the share asked for.
             positions[-1] += walk[-1] * np.float32(1 - self.config.position_correction)
         return Sample(positions, window.particle_type, window.material_property)
-
-    def mobile(self, particle_type: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which particles are not kinematic, bool ``[N]``."""
-        return ~np.isin(particle_type, self.metadata.kinematic_types)
 
     def collate(self, samples: Sequence[Sample]) -> Batch:
         """One batch with its base graph, built on the noisy positions."""
@@ -148,7 +144,7 @@ class Windows(Dataset[Sample]):
             frames=torch.from_numpy(np.ascontiguousarray(frames.transpose(1, 0, 2))),
             particle_type=torch.from_numpy(particle_type),
             material=torch.from_numpy(np.concatenate(materials)) if materials else None,
-            mobile=torch.from_numpy(self.mobile(particle_type)),
+            mobile=torch.from_numpy(self.metadata.mobile(particle_type)),
             ptr=torch.from_numpy(ptr),
             graph=graph,
         )

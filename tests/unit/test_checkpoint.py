@@ -44,13 +44,6 @@ def test_round_trip(checkpoint: Checkpoint, tmp_path: Path) -> None:
     assert all(torch.equal(ours[k], theirs[k]) for k in ours)
 
 
-def test_the_average_is_what_is_used(checkpoint: Checkpoint) -> None:
-    average = {k: v + 1 for k, v in checkpoint.group("model").items()}
-    averaged = replace(checkpoint, tensors=checkpoint.tensors | with_prefix("average", average))
-    used = averaged.simulator().state_dict()
-    assert all(torch.equal(used[k], average[k]) for k in used)
-
-
 def test_a_run_folder_means_its_best(checkpoint: Checkpoint, tmp_path: Path) -> None:
     write_checkpoint(tmp_path / LAST, checkpoint)
     write_checkpoint(tmp_path / BEST, replace(checkpoint, step=5))

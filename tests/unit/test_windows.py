@@ -133,18 +133,6 @@ def test_adaptive_training_reads_one_frame_more(windows: Windows) -> None:
     assert len(longer) == len(windows) - len(windows.trajectories)
 
 
-def test_noise_spreads_over_its_range(windows: Windows) -> None:
-    config = replace(windows.config, noise_spread=4.0)
-    varied = Windows(windows.trajectories, windows.metadata, config, noise=3e-4)
-    clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
-    stds = []
-    for number in range(60):
-        noise = varied[0, number].positions - clean[0, number].positions
-        stds.append(np.diff(noise[:6], axis=0)[-1].std())
-    assert 2e-4 < min(stds) < 5e-4
-    assert 9e-4 < max(stds) < 1.8e-3
-
-
 def test_position_correction_undoes_its_share(windows: Windows) -> None:
     config = replace(windows.config, position_correction=0.25)
     corrected = Windows(windows.trajectories, windows.metadata, config, noise=3e-4)[0, 5].positions

@@ -61,6 +61,10 @@ class Metadata:
         """Period length per axis, `inf` on open axes; None when nothing is periodic."""
         return period_lengths(self.bounds, self.periodic)
 
+    def mobile(self, particle_type: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """Which particles of these types `[N]` are not kinematic, bool `[N]`."""
+        return ~np.isin(particle_type, self.kinematic_types)
+
     def to_json(self) -> dict[str, Any]:
         """Plain values that `from_json` reads back exactly."""
         return asdict(self)

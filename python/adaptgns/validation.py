@@ -1,0 +1,59 @@
+"""What is measured during training, on trajectories that training does not see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from adaptgns.config import HISTORY, TrainConfig
+from adaptgns.data.trajectories import Trajectories
+from adaptgns.losses import training_loss
+from adaptgns.metrics import position_mse
+from adaptgns.policies import Fixed
+from adaptgns.rollout import steps
+from adaptgns.simulator import Simulator
+from adaptgns.windows import Windows
+
+ONE_STEP_WINDOWS = 64
+"""Windows, evenly spread over the split, of the one-step figures"""
+MARKS = (50, 100, 200)
+
+
+def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> dict[str, float]:
+    """One-step and rollout errors on the base graph, from true inputs without noise.
+
+    - ``valid_loss`` and ``valid_one_step_mse`` (normalized accelerations, mean over particles and
+      dimensions): of windows spread evenly over the split.
+    - ``valid_rollout_mse`` and ``valid_rollout_mse_k``: squared position error, mean over
+      particles, dimensions and the first trajectories; the former over all steps, too.
+    """
+    plain = replace(config, graph="base", mirror=False)
+    windows = Windows(valid, simulator.metadata, plain, noise=0.0)
+    numbers = np.linspace(0, len(windows) - 1, min(ONE_STEP_WINDOWS, len(windows)), dtype=int)
+    losses, errors = [], []
+    for number in numbers:
+        batch = windows.collate([windows[0, int(number)]]).to(simulator.lower.device)
+        with torch.inference_mode():
+            prediction = simulator(batch.window, batch.particle_type, batch.graph, batch.material)
+            target = simulator.target(batch.window, batch.following)
+            losses.append(float(training_loss(config.loss, prediction, target, batch.mobile)))
+            errors.append(float(training_loss("mse", prediction, target, batch.mobile)))
+
+    curves = []
+    for index in range(min(len(valid), config.validate_trajectories)):
+        trajectory = valid[index]
+        true = trajectory.positions[HISTORY:][: config.validate_horizon]
+        rolled = steps(simulator, trajectory, Fixed(), len(true))
+        predicted = np.stack([step.positions for step in rolled])
+        mobile = simulator.metadata.mobile(trajectory.particle_type)
+        curves.append(position_mse(predicted, true, mobile, simulator.metadata.box))
+    shortest = min(map(len, curves))
+    curve = np.mean([c[:shortest] for c in curves], axis=0)
+    return {
+        "valid_loss": float(np.mean(losses)),
+        "valid_one_step_mse": float(np.mean(errors)),
+        "valid_rollout_mse": float(curve.mean()),
+        **{f"valid_rollout_mse_{k}": float(curve[k - 1]) for k in MARKS if k <= shortest},
+    }
