@@ -64,9 +64,10 @@ class RolloutConfig:
     data: str | None = None
     """Folder of a data set or name of an embedded one; None: the one the model was trained on."""
     split: Literal["train", "valid", "test"] = "test"
+    """Which part of the data."""
     policy: PolicyName = "fixed"
-    """Which graph each step has; fixed radius, adaptive (sigma of the step before),
-    two-pass (sigma of this step), random (the same share of particles), knn."""
+    """Graph of each step: fixed radius, adaptive (sigma of the step before), two-pass (sigma of
+    this step), random (the same share of particles), knn."""
     adaptive: AdaptiveConfig = field(default_factory=AdaptiveConfig)
     k: int = 6
     """Neighbours of the policy knn."""

@@ -355,7 +355,7 @@ def unit_notes(files: Sequence[RolloutFile]) -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
-    config = tyro.cli(EvaluateConfig, args=argv, description=__doc__)
+    config = tyro.cli(EvaluateConfig, args=argv, prog="python -m adaptgns.evaluate")
     console = Console()
     out = config.rollouts[0].parent if config.out is None and config.rollouts else config.out
     try:

@@ -54,7 +54,7 @@ def animate(
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
     config = tyro.extras.subcommand_cli_from_dict(
-        {"animate": AnimateConfig}, args=argv, description=__doc__
+        {"animate": AnimateConfig}, args=argv, prog="python -m adaptgns.plot"
     )
     console = Console()
     try:

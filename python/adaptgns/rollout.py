@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -176,13 +177,16 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
     config = tyro.cli(
-        RolloutConfig, args=argv, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)
+        RolloutConfig,
+        args=argv,
+        prog="python -m adaptgns.rollout",
+        config=(tyro.conf.OmitArgPrefixes,),
     )
     console = Console()
     try:
         write_rollouts(config, console)
     except (ValueError, OSError) as error:
-        console.print(f"error: {error}", markup=False, style="red")
+        print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     console.print(f"{config.out}", highlight=False)
 

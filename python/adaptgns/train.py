@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         console.print(str(stopped), markup=False)
         raise SystemExit(1) from None
     except (ValueError, OSError) as error:
-        console.print(f"error: {error}", markup=False, style="red")
+        print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
 
 
@@ -60,8 +60,10 @@ def parse(arguments: list[str]) -> TrainConfig:
         TrainConfig,
         default=default,
         args=arguments,
-        description=f"{__doc__}\n\n--config FILE.json starts from the configuration that a run "
-        "saved, --resume DIR from that of the run it goes on with; other options change it.",
+        prog="python -m adaptgns.train",
+        description="A training run, from the data to the table of results. --config FILE.json "
+        "starts from the configuration that a run saved, --resume DIR from that of the run it "
+        "goes on with; other options change it.",
     )
 
 

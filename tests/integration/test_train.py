@@ -46,7 +46,7 @@ def test_an_existing_run_is_not_overwritten(
     with pytest.raises(SystemExit) as exit_:
         main(["--preset", "smoke", "--data", str(drops), "--out", str(tmp_path)])
     assert exit_.value.code == 2
-    assert "holds a run already" in capsys.readouterr().out
+    assert "holds a run already" in capsys.readouterr().err
     assert (tmp_path / LAST).read_bytes() == b"precious"
 
 
@@ -64,7 +64,7 @@ def test_wrong_arguments_are_named(
     with pytest.raises(SystemExit) as exit_:
         main(arguments)
     assert exit_.value.code == 2
-    assert message in capsys.readouterr().out
+    assert message in capsys.readouterr().err
 
 
 def test_killed_ten_times_and_resumed_equals_uninterrupted(drops: Path, tmp_path: Path) -> None:
