@@ -73,8 +73,8 @@ pub(crate) fn symmetric_eigen<const D: usize>(matrix: &Matrix<D>) -> ([f64; D], 
 /// possible angles.
 fn rotate<const D: usize>(a: &mut Matrix<D>, vectors: &mut Matrix<D>, p: usize, q: usize) {
     let theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
-    let tangent = theta.signum() / (theta.abs() + theta.hypot(1.0));
-    let cosine = 1.0 / tangent.hypot(1.0);
+    let tangent = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
+    let cosine = 1.0 / (tangent * tangent + 1.0).sqrt();
     let sine = tangent * cosine;
     for row in a.iter_mut().chain(vectors.iter_mut()) {
         let (x, y) = (row[p], row[q]);

@@ -215,3 +215,76 @@ impl Sand {
         self.mu * linalg::dot(&strain, &strain) + 0.5 * self.lambda * volumetric.powi(2)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WATER: Water = Water {
+        sound_speed: 14.0,
+        exponent: 7.0,
+        viscosity: 0.0,
+        cohesion: 0.05,
+    };
+    const SAND: Sand = Sand {
+        lambda: 350.0,
+        mu: 230.0,
+        friction_angle: 0.6,
+        wall_friction: 0.4,
+        collision_time: 0.0,
+    };
+
+    /// A slow compression along the first axis: the work done is the energy stored.
+    fn assert_work_is_stored(material: Material) {
+        let mut history = History::<2>::at_rest();
+        let (rate, dt) = ([[-1.0, 0.0], [0.0, -0.8]], 1e-5);
+        let mut work = 0.0;
+        for _ in 0..1000 {
+            let before = material.energy(&history);
+            let stress = material.stress(&mut history, &rate, dt);
+            let power = stress[0][0] * rate[0][0] + stress[1][1] * rate[1][1];
+            work += power * dt;
+            assert!(material.energy(&history) > before);
+        }
+        let stored = material.energy(&history);
+        assert!((work / stored - 1.0).abs() < 0.01, "{work} and {stored}");
+    }
+
+    #[test]
+    fn stress_is_the_derivative_of_energy() {
+        assert_work_is_stored(Material::Water(WATER));
+        assert_work_is_stored(Material::Sand(SAND));
+    }
+
+    #[test]
+    fn sound_speed_is_the_stiffness() {
+        let history = History::<2>::at_rest;
+        let stress = WATER.stress(&mut history(), &[[-1.0, 0.0], [0.0, 0.0]], 1e-6);
+        assert!((stress[0][0] / -1e-6 / WATER.sound_speed.powi(2) - 1.0).abs() < 1e-3);
+        let stress = SAND.stress(&mut history(), &[[-1.0, 0.0], [0.0, -1.0]], 1e-6);
+        let expected = -2.0 * (SAND.lambda + SAND.mu) * 1e-6;
+        assert!((stress[0][0] / expected - 1.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn sheared_sand_stays_on_the_cone_and_keeps_its_volume() {
+        let mut gained = 0.0;
+        let strain = SAND.project([-0.05, 0.03], &mut gained);
+        assert!((strain[0] + strain[1] + 0.02).abs() < 1e-15);
+        assert!(strain[1] - strain[0] < 0.08);
+        assert_eq!(gained, 0.0);
+        let again = SAND.project(strain, &mut gained);
+        assert!((again[0] - strain[0]).abs() < 1e-15, "projected twice");
+    }
+
+    #[test]
+    fn sand_bears_load_only_after_giving_back_the_volume_it_gained() {
+        let mut gained = 0.0;
+        assert_eq!(SAND.project([0.02, 0.01], &mut gained), [0.0; 2]);
+        assert!((gained - 0.03).abs() < 1e-15);
+        assert_eq!(SAND.project([-0.01, -0.01], &mut gained), [0.0; 2]);
+        let strain = SAND.project([-0.01, -0.01], &mut gained);
+        assert!((strain[0] + 0.005).abs() < 1e-15);
+        assert_eq!(gained, 0.0);
+    }
+}

@@ -115,7 +115,9 @@ impl<const D: usize> Simulation<D> {
             sound = sound.max(self.material.sound_speed(&particle.history));
         }
         let speed = fastest.sqrt() + sound;
-        let steps = (FRAME_TIME * speed / (COURANT * self.grid.spacing)).ceil().max(1.0);
+        let steps = (FRAME_TIME * speed / (COURANT * self.grid.spacing))
+            .ceil()
+            .max(1.0);
         self.change_step(FRAME_TIME / steps);
         for _ in 0..steps as usize {
             self.advance_step();

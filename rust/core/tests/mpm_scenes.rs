@@ -1,0 +1,142 @@
+//! Scenes are the same for a seed, stay in their box, and look like their counterparts.
+
+use adaptgns_core::Error;
+use adaptgns_core::mpm::{Scene, Trajectory, WALLS, trajectory};
+use rayon::prelude::*;
+
+const SCENES: [Scene; 2] = [Scene::WaterDrop, Scene::Sand];
+
+fn assert_inside<const D: usize>(trajectory: &Trajectory<D>) {
+    for position in &trajectory.positions {
+        for x in position {
+            assert!(
+                (WALLS.low as f32..=WALLS.high as f32).contains(x),
+                "{position:?}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_hundred_seeds_stay_in_the_box_for_a_thousand_frames() {
+    (0..100_u64).into_par_iter().for_each(|seed| {
+        let scene = SCENES[seed as usize % 2];
+        let made = trajectory::<2>(scene, seed, 1000, Some((16, 150))).unwrap();
+        assert!((16..=150).contains(&made.particles));
+        assert_eq!(made.positions.len(), 1000 * made.particles);
+        assert_inside(&made);
+    });
+}
+
+#[test]
+fn full_scenes_and_three_dimensions_stay_in_the_box() {
+    (0..4_u64).into_par_iter().for_each(|seed| {
+        let scene = SCENES[seed as usize % 2];
+        assert_inside(&trajectory::<2>(scene, seed, 320, None).unwrap());
+        let solid = trajectory::<3>(scene, seed, 150, Some((300, 600))).unwrap();
+        assert!((300..=600).contains(&solid.particles));
+        assert_inside(&solid);
+    });
+}
+
+#[test]
+fn a_seed_is_the_same_alone_and_among_many_threads() {
+    for scene in SCENES {
+        let make = |seed: u64| trajectory::<2>(scene, seed, 60, Some((100, 200))).unwrap();
+        let alone: Vec<_> = (0..6).map(make).collect();
+        let together: Vec<_> = (0..24_u64).into_par_iter().map(|k| make(k % 6)).collect();
+        for (k, among) in together.iter().enumerate() {
+            assert_eq!(among, &alone[k % 6]);
+        }
+        assert_ne!(alone[0], alone[1]);
+    }
+}
+
+#[test]
+fn the_number_of_particles_is_the_one_asked_for() {
+    for scene in SCENES {
+        for count in [16, 17, 101, 997, 2000] {
+            let made = trajectory::<2>(scene, 3, 1, Some((count, count))).unwrap();
+            assert_eq!(made.particles, count);
+        }
+        let made = trajectory::<3>(scene, 3, 1, Some((1001, 1001))).unwrap();
+        assert_eq!(made.particles, 1001);
+    }
+}
+
+#[test]
+fn wrong_arguments_are_named() {
+    let argument = |result: Result<Trajectory<2>, Error>| match result {
+        Err(Error::InvalidArgument { argument, .. }) => argument,
+        other => panic!("{other:?}"),
+    };
+    let make = |frames, particles| trajectory::<2>(Scene::WaterDrop, 0, frames, particles);
+    assert_eq!(argument(make(0, None)), "frames");
+    assert_eq!(argument(make(1, Some((10, 100)))), "particles");
+    assert_eq!(argument(make(1, Some((200, 100)))), "particles");
+    assert_eq!(argument(make(1, Some((100, 1_000_000)))), "particles");
+    assert!(matches!(make(usize::MAX, None), Err(Error::OutOfMemory(_))));
+    let unknown = Scene::from_name("lava").unwrap_err().to_string();
+    assert!(unknown.contains("'lava'") && unknown.contains("'waterdrop', 'sand'"));
+}
+
+/// Mean degree, and mean over particles of the part of their pairs of neighbours that
+/// are neighbours too (networkx's average clustering), within the published radius.
+fn graph_statistics(positions: &[[f32; 2]]) -> (f64, f64) {
+    let near = |a: usize, b: usize| {
+        let square: f32 = (0..2)
+            .map(|k| (positions[a][k] - positions[b][k]).powi(2))
+            .sum();
+        a != b && square <= 0.015 * 0.015
+    };
+    let count = positions.len();
+    let neighbours: Vec<Vec<usize>> = (0..count)
+        .map(|a| (0..count).filter(|&b| near(a, b)).collect())
+        .collect();
+    let degree: usize = neighbours.iter().map(Vec::len).sum();
+    let clustering: f64 = neighbours
+        .iter()
+        .filter(|list| list.len() > 1)
+        .map(|list| {
+            let linked: usize = list
+                .iter()
+                .map(|&a| list.iter().filter(|&&b| near(a, b)).count())
+                .sum();
+            linked as f64 / (list.len() * (list.len() - 1)) as f64
+        })
+        .sum();
+    (degree as f64 / count as f64, clustering / count as f64)
+}
+
+/// The marks of `benchmarks/generate.py`, which compares more scenes and more figures.
+#[test]
+fn scenes_have_the_published_graph_statistics() {
+    let published = [
+        (Scene::WaterDrop, 567.0, 5.42, 0.494),
+        (Scene::Sand, 1270.0, 6.76, 0.500),
+    ];
+    for (scene, particles, degree, clustering) in published {
+        let counts = (0..200).map(|seed| trajectory::<2>(scene, seed, 1, None).unwrap().particles);
+        let mean = counts.sum::<usize>() as f64 / 200.0;
+        assert!((mean / particles - 1.0).abs() < 0.1, "{mean} particles");
+
+        let seeds = 8;
+        let found: Vec<_> = (0..seeds)
+            .into_par_iter()
+            .map(|seed| {
+                let made = trajectory::<2>(scene, seed, 101, None).unwrap();
+                graph_statistics(&made.positions[100 * made.particles..])
+            })
+            .collect();
+        let mean_degree = found.iter().map(|pair| pair.0).sum::<f64>() / seeds as f64;
+        let mean_clustering = found.iter().map(|pair| pair.1).sum::<f64>() / seeds as f64;
+        assert!(
+            (mean_degree / degree - 1.0).abs() < 0.15,
+            "{scene:?} {mean_degree}"
+        );
+        assert!(
+            (mean_clustering - clustering).abs() < 0.08,
+            "{scene:?} {mean_clustering}"
+        );
+    }
+}
