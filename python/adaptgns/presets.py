@@ -33,6 +33,7 @@ PRESETS: dict[Preset, TrainConfig] = {
         position_correction=0.1,
         mirror=True,
         validate_every=3_000,
+        validate_horizon=100,
         test_trajectories=10,
     ),
     # The paper's sizes (and geoelements/gns's schedule).

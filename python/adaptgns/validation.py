@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from adaptgns.config import HISTORY, TrainConfig
 from adaptgns.data.trajectories import Trajectories
@@ -19,6 +20,8 @@ from adaptgns.windows import Windows
 ONE_STEP_WINDOWS = 64
 """Windows, evenly spread over the split, of the one-step figures"""
 MARKS = (50, 100, 200)
+COLLAPSED = 20
+"""How many times the edges of the first step mean that a rollout has collapsed"""
 
 
 def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> dict[str, float]:
@@ -27,7 +30,9 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
     - ``valid_loss`` and ``valid_one_step_mse`` (normalized accelerations, mean over particles and
       dimensions): of windows spread evenly over the split.
     - ``valid_rollout_mse`` and ``valid_rollout_mse_k``: squared position error, mean over
-      particles, dimensions and the first trajectories; the former over all steps, too.
+      particles, dimensions and the first trajectories; the former over all steps, too. A rollout
+      whose particles collapse into a pile, where every step costs the square of their number, is
+      stopped, and its error is infinite from there.
     """
     plain = replace(config, graph="base", mirror=False)
     windows = Windows(valid, simulator.metadata, plain, noise=0.0)
@@ -45,10 +50,19 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
     for index in range(min(len(valid), config.validate_trajectories)):
         trajectory = valid[index]
         true = trajectory.positions[HISTORY:][: config.validate_horizon]
-        rolled = steps(simulator, trajectory, Fixed(), len(true))
-        predicted = np.stack([step.positions for step in rolled])
         mobile = simulator.metadata.mobile(trajectory.particle_type)
-        curves.append(position_mse(predicted, true, mobile, simulator.metadata.box))
+        predicted: list[NDArray[np.float32]] = []
+        edges = 0
+        for step in steps(simulator, trajectory, Fixed(), len(true)):
+            predicted.append(step.positions)
+            edges = edges or step.edges
+            if step.edges > COLLAPSED * edges:
+                break
+        curve = np.full(len(true), np.inf)
+        curve[: len(predicted)] = position_mse(
+            np.stack(predicted), true[: len(predicted)], mobile, simulator.metadata.box
+        )
+        curves.append(curve)
     shortest = min(map(len, curves))
     curve = np.mean([c[:shortest] for c in curves], axis=0)
     return {
