@@ -18,8 +18,9 @@ from pathlib import Path
 
 import networkx as nx
 import numpy as np
-from adaptgns._core import simulate
 from scipy.spatial import cKDTree
+
+from adaptgns._core import simulate
 
 RADIUS = 0.015
 # WaterDrop's 1,000 training, 30 validation and 30 test trajectories.

@@ -262,7 +262,9 @@ class Log:
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Log ``values`` at ``step``."""
-        self.file.write(json.dumps({"step": step, **values}) + "\n")
+        # JSON has no infinity: a diverged rollout's error is null.
+        finite = {name: v if math.isfinite(v) else None for name, v in values.items()}
+        self.file.write(json.dumps({"step": step, **finite}) + "\n")
         self.file.flush()
         for name, value in values.items():
             self.board.add_scalar(name, value, step)

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+
 from adaptgns._core import simulate
 
 SMALL = (60, 120)
