@@ -25,7 +25,7 @@ PRESETS: dict[Preset, TrainConfig] = {
         model=ModelConfig(latent=64, steps=5, walls=True),
         steps=9_000,
         batch=4,
-        batch_particles=800,
+        batch_particles=1_200,
         lr=1e-3,
         schedule="cosine",
         warmup=200,
