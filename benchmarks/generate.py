@@ -109,7 +109,7 @@ def compare(scene: str, trajectories: int, threads: int) -> dict[str, object]:
             "clustering": graphs[:, 1].std().round(4),
         },
         "degree_over_time": {
-            frame: np.round(np.mean([degree(positions[frame]) for positions in made]), 3)
+            frame: round(float(np.mean([degree(positions[frame]) for positions in made])), 3)
             for frame in CURVE_FRAMES
             if frame < frames
         },

@@ -110,16 +110,16 @@ fn a_collision_in_the_air_conserves_mass_and_momentum() {
         let time = FRAME_TIME * frames as f64;
         assert_eq!(simulation.mass(), mass);
         let expected = [momentum[0], momentum[1] - mass * GRAVITY * time];
-        for axis in 0..2 {
-            let change = simulation.momentum()[axis] - expected[axis];
-            assert!(change.abs() < 1e-12 * mass, "axis {axis}: {change}");
+        for (now, expected) in simulation.momentum().into_iter().zip(expected) {
+            let change = now - expected;
+            assert!(change.abs() < 1e-12 * mass, "{change}");
         }
         let flight = [
             momentum[0] / mass * time,
             momentum[1] / mass * time - 0.5 * GRAVITY * time * time,
         ];
-        for axis in 0..2 {
-            let error = mean(&simulation, axis) - centre[axis] - flight[axis];
+        for (axis, flown) in flight.into_iter().enumerate() {
+            let error = mean(&simulation, axis) - centre[axis] - flown;
             assert!(error.abs() < 1e-12, "axis {axis}: {error}");
         }
     }

@@ -74,8 +74,8 @@ impl<const D: usize> Grid<D> {
         }
     }
 
-    /// Nodes and weights of a particle inside the walls (Hu et al. 2018, eq. of the
-    /// quadratic kernel; the splines sum to one).
+    /// Nodes and weights of the quadratic B-spline around a particle inside the walls;
+    /// the weights sum to one.
     pub(crate) fn stencil(&self, position: &[f64; D]) -> Stencil<D> {
         let mut base = 0;
         let mut weights = [[0.0; REACH]; D];

@@ -37,7 +37,7 @@ pub struct Water {
     /// Kinematic viscosity \[m²/s\].
     pub viscosity: f64,
     /// Largest expansion that water resists and remembers, as a logarithm of volume.
-    /// What is torn further apart is spray, at rest density when it meets water again.
+    /// What is torn further apart is spray, as good as at rest when it meets water again.
     pub cohesion: f64,
 }
 

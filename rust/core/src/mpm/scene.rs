@@ -25,9 +25,9 @@ const JITTER: f64 = 0.45;
 /// A family of random scenes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scene {
-    /// One or two drops of water.
+    /// One or two blocks of water.
     WaterDrop,
-    /// One to three piles of sand.
+    /// One to three blocks of sand.
     Sand,
 }
 
@@ -201,17 +201,12 @@ fn draw_blocks<const D: usize>(rng: &mut Rng, recipe: &Recipe, count: usize) -> 
             return blocks;
         }
     }
-    // A cube of half the box's volume fits for every count that is accepted.
-    let mut block = draw_block(
-        rng,
-        &Recipe {
-            aspect: 1.0,
-            ..*recipe
-        },
-        count,
-    );
-    block.particles = count;
-    vec![block]
+    // A cube of every volume that is accepted fits.
+    let cube = Recipe {
+        aspect: 1.0,
+        ..*recipe
+    };
+    vec![draw_block(rng, &cube, count)]
 }
 
 /// Number of blocks, of which `probabilities[k]` is that of k + 1.
