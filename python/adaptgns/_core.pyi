@@ -90,4 +90,30 @@ def simulate(
     frames: int,
     dim: int = 2,
     particles: tuple[int, int] | None = None,
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]: ...
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """One trajectory of the embedded data generator (MLS-MPM, Hu et al. 2018).
+
+    A box from 0.1 to 0.9 along every axis [m], gravity 9.81 m/s² against the second axis,
+    0.0025 s between frames. The first frame is the scene as drawn.
+
+    Args:
+        scene: 'waterdrop' or 'sand'.
+        seed: any integer from 0 to 2**64 - 1; the result depends on the arguments alone,
+            whatever else runs.
+        frames: number of frames T, at least 1.
+        dim: 2 or 3.
+        particles: smallest and largest number of particles, from 16 to as many as fill half
+            the box; None for the published mix.
+
+    Returns:
+        Positions [T, N, dim], all inside the box, and GNS's particle types [N]: 5 for water,
+        6 for sand.
+
+    One thread does the work, with the GIL released: call it from several threads to make
+    several trajectories at once.
+
+    Raises:
+        ValueError: an argument outside what is accepted.
+        OverflowError: a negative or too large integer.
+        MemoryError: the trajectory does not fit in memory.
+    """

@@ -34,11 +34,11 @@ def constant_gravity(
     """``[steps, N, d]`` positions in free flight: v_k = v_k−1 − g, x_k = x_k−1 + v_k.
 
     As :func:`constant_velocity`, with g = ``gravity_per_frame2`` (length per frame², that is
-    :data:`GRAVITY` · dt²) along the last axis. A wall that clips a particle takes the velocity
+    :data:`GRAVITY` · dt²) along the second axis. A wall that clips a particle takes the velocity
     towards it, so that what hits the ceiling falls off again.
     """
     acceleration = np.zeros(initial.shape[2])
-    acceleration[-1] = -gravity_per_frame2
+    acceleration[1] = -gravity_per_frame2
     return _flight(initial, steps, bounds, acceleration, box)
 
 

@@ -262,7 +262,7 @@ def baseline_predictions(truth: Truth) -> list[tuple[str, NDArray[np.float64]]]:
     predictions = [
         ("constant velocity", constant_velocity(truth.initial, steps, bounds, box=box)),
     ]
-    if not metadata.periodic[-1]:
+    if not metadata.periodic[1]:
         gravity = GRAVITY * metadata.dt**2
         fall = constant_gravity(truth.initial, steps, bounds, gravity, box=box)
         predictions.append(("constant gravity", fall))
