@@ -7,8 +7,8 @@
 //! and a process with another id makes its own and leaks the old one.
 
 use std::num::NonZeroUsize;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicPtr, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicPtr, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
@@ -80,37 +80,35 @@ fn helpers() -> &'static Helpers {
     }
 }
 
-/// `task(0), …, task(count - 1)`, in that order, computed by up to `threads` threads.
-pub fn map<R: Send>(threads: Threads, count: usize, task: impl Fn(usize) -> R + Sync) -> Vec<R> {
+/// `task` of every item, in the order of the items, computed by up to `threads` threads.
+pub fn map<I: Send, R: Send>(
+    threads: Threads,
+    items: Vec<I>,
+    task: impl Fn(I) -> R + Sync,
+) -> Vec<R> {
     let wanted = match threads {
         Threads::All => usize::MAX,
         Threads::AtMost(limit) => limit.get(),
     };
+    let count = items.len();
     let pool = (wanted > 1 && count > 1).then(helpers).and_then(|helpers| {
         let spawned = helpers.count.min(wanted - 1).min(count - 1);
         helpers.pool.as_ref().map(|pool| (pool, spawned))
     });
     let Some((pool, spawned)) = pool else {
-        return (0..count).map(task).collect();
+        return items.into_iter().map(task).collect();
     };
 
-    let next = AtomicUsize::new(0);
+    let waiting = Mutex::new(items.into_iter().enumerate());
     let finished = Mutex::new(Vec::with_capacity(count));
     let work = || {
         let mut mine = Vec::new();
         loop {
-            let i = next.fetch_add(1, Ordering::Relaxed);
-            if i >= count {
-                break;
-            }
-            mine.push((i, task(i)));
+            let next = lock(&waiting).next();
+            let Some((i, item)) = next else { break };
+            mine.push((i, task(item)));
         }
-        if !mine.is_empty() {
-            finished
-                .lock()
-                .unwrap_or_else(|poisoned| poisoned.into_inner())
-                .append(&mut mine);
-        }
+        lock(&finished).append(&mut mine);
     };
     pool.in_place_scope(|scope| {
         for _ in 0..spawned {
@@ -118,9 +116,13 @@ pub fn map<R: Send>(threads: Threads, count: usize, task: impl Fn(usize) -> R + 
         }
         work();
     });
-    let mut results = finished
-        .into_inner()
-        .unwrap_or_else(|poisoned| poisoned.into_inner());
+    let mut results = std::mem::take(&mut *lock(&finished));
     results.sort_unstable_by_key(|&(i, _)| i);
     results.into_iter().map(|(_, result)| result).collect()
+}
+
+/// Locks; what a panicking thread held is as good as ever, and its panic surfaces when
+/// the scope ends.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

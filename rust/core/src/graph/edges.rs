@@ -1,5 +1,7 @@
 //! From the rows that each task found to one edge list.
 
+use std::mem::MaybeUninit;
+
 use super::Graph;
 use super::memory::Budget;
 use super::order::{RANKED, sort_row};
@@ -8,9 +10,11 @@ use crate::threads::{self, Threads};
 
 /// The senders of some receivers, row after row.
 pub(super) struct Rows {
-    /// Room for what is to come at the end.
+    /// Has room for what is to come at its end.
     senders: Vec<i32>,
     used: usize,
+    /// Of those used, what the budget knows of.
+    charged: usize,
     counts: Vec<u32>,
 }
 
@@ -19,12 +23,13 @@ impl Rows {
         Self {
             senders: vec![0; 8 * receivers + RANKED],
             used: 0,
+            charged: 0,
             counts: Vec::with_capacity(receivers),
         }
     }
 
     /// Adds a row of the `n` senders at the front of `found`, sorted and without
-    /// `dropped`.
+    /// `dropped`; see [`sort_row`].
     #[inline(always)]
     pub fn push(
         &mut self,
@@ -45,61 +50,83 @@ impl Rows {
 
     #[cold]
     fn grow(&mut self, n: usize, budget: &Budget) -> Result<(), Error> {
+        budget.charge(self.used - self.charged)?;
+        self.charged = self.used;
         let more = self.senders.len().max(n + RANKED);
-        budget.charge(more)?;
+        self.senders
+            .try_reserve_exact(more)
+            .map_err(|_| no_memory_for(self.used + n))?;
         self.senders.resize(self.senders.len() + more, 0);
         Ok(())
     }
 }
 
-/// Copies `parts`, each the rows of the receivers named, into one edge list over
+fn no_memory_for(edges: usize) -> Error {
+    Error::OutOfMemory(format!(
+        "no memory for {edges} edges; use a smaller radius or fewer particles"
+    ))
+}
+
+/// Receivers whose rows are written as one task.
+const TASK: usize = 4096;
+
+/// Puts `parts`, each the rows of the receivers named, into one edge list over
 /// `particles`, sorted by receiver. Every particle is named once.
 pub(super) fn assemble(
     particles: usize,
     parts: &[(&[i32], &Rows)],
     threads: Threads,
+    budget: &Budget,
 ) -> Result<Graph, Error> {
-    let mut offsets = vec![0_i64; particles + 1];
-    for (receivers, rows) in parts {
-        for (&receiver, &count) in receivers.iter().zip(&rows.counts) {
-            offsets[receiver as usize + 1] = i64::from(count);
+    let mut rows: Vec<&[i32]> = vec![&[]; particles];
+    for (receivers, part) in parts {
+        let mut senders = &part.senders[..];
+        for (&receiver, &count) in receivers.iter().zip(&part.counts) {
+            (rows[receiver as usize], senders) = senders.split_at(count as usize);
         }
     }
+    let mut offsets = Vec::with_capacity(particles + 1);
     let mut total = 0;
-    for offset in &mut offsets {
-        total += *offset;
-        *offset = total;
-    }
+    offsets.push(0);
+    offsets.extend(rows.iter().map(|row| {
+        total += row.len() as i64;
+        total
+    }));
+
     let edges = total as usize;
+    budget.check(edges)?;
     let mut edge_index: Vec<i64> = Vec::new();
-    if edge_index.try_reserve_exact(2 * edges).is_err() {
-        return Err(Error::OutOfMemory(format!(
-            "no memory for the {edges} edges of the graph; use a smaller radius or fewer particles"
-        )));
+    edge_index
+        .try_reserve_exact(2 * edges)
+        .map_err(|_| no_memory_for(edges))?;
+    let (mut senders, mut receivers) =
+        edge_index.spare_capacity_mut()[..2 * edges].split_at_mut(edges);
+    let mut tasks = Vec::new();
+    for (t, rows) in rows.chunks(TASK).enumerate() {
+        let first = t * TASK;
+        let edges = (offsets[first + rows.len()] - offsets[first]) as usize;
+        tasks.push((
+            first,
+            rows,
+            senders.split_off_mut(..edges).expect("edges left"),
+            receivers.split_off_mut(..edges).expect("edges left"),
+        ));
     }
-    let out = Out(edge_index.as_mut_ptr());
-    threads::map(threads, parts.len(), |p| {
-        let out = &out;
-        let (receivers, rows) = parts[p];
+    threads::map(threads, tasks, |(first, rows, senders, receivers)| {
         let mut at = 0;
-        for (&receiver, &count) in receivers.iter().zip(&rows.counts) {
-            let row = &rows.senders[at..at + count as usize];
-            let begin = offsets[receiver as usize] as usize;
-            for (k, &sender) in row.iter().enumerate() {
-                unsafe {
-                    out.0.add(begin + k).write(i64::from(sender));
-                    out.0.add(edges + begin + k).write(i64::from(receiver));
-                }
+        for (receiver, row) in (first as i64..).zip(rows) {
+            let end = at + row.len();
+            for (slot, &sender) in senders[at..end].iter_mut().zip(*row) {
+                slot.write(i64::from(sender));
             }
-            at += count as usize;
+            receivers[at..end].fill(MaybeUninit::new(receiver));
+            at = end;
         }
     });
+    // SAFETY: the tasks' rows partition both halves, and each wrote all of its part.
     unsafe { edge_index.set_len(2 * edges) };
     Ok(Graph {
         edge_index,
         offsets,
     })
 }
-
-struct Out(*mut i64);
-unsafe impl Sync for Out {}

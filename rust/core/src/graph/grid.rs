@@ -8,7 +8,7 @@
 
 use std::ops::Range;
 
-use super::scalar::Scalar;
+use super::scalar::{BLOCK, Scalar};
 
 /// Above this many cells per particle (plus a constant) a grid stores occupied rows only.
 const MOST_CELLS_PER_PARTICLE: usize = 16;
@@ -39,8 +39,6 @@ enum Rows<const D: usize> {
     Dense {
         /// First particle of each cell, and one past the last particle.
         starts: Vec<u32>,
-        /// Cell of each particle.
-        cell: Vec<u32>,
     },
     Sparse {
         /// Cell coordinates of each row, x set to zero, in ascending order from the
@@ -154,14 +152,13 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
         let cell_of: Vec<u32> = positions
             .iter()
             .map(|p| {
-                (0..D).rev().fold(0, |row, a| {
+                let cell = (0..D).rev().fold(0, |row, a| {
                     row * axes[a].count as u32 + axes[a].cell(p[a]) as u32
-                })
+                });
+                starts[cell as usize] += 1;
+                cell
             })
             .collect();
-        for &c in &cell_of {
-            starts[c as usize] += 1;
-        }
         // From counts to ends; the sort below, from the last particle to the first,
         // moves each end back to its start.
         let mut total = 0;
@@ -169,24 +166,41 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
             total += *start;
             *start = total;
         }
-        let n = positions.len();
-        let mut index = vec![0_i32; n];
-        let mut cell = vec![0_u32; n];
-        let mut coords: [Vec<T>; D] = std::array::from_fn(|_| vec![T::default(); n]);
-        for (i, (&c, p)) in cell_of.iter().zip(positions).enumerate().rev() {
-            starts[c as usize] -= 1;
-            let slot = starts[c as usize] as usize;
-            index[slot] = (first + i) as i32;
-            cell[slot] = c;
-            for a in 0..D {
-                coords[a][slot] = p[a];
-            }
+        let mut order = vec![0_u32; positions.len()];
+        for (i, &cell) in cell_of.iter().enumerate().rev() {
+            starts[cell as usize] -= 1;
+            order[starts[cell as usize] as usize] = i as u32;
         }
+        Self::sorted(
+            positions,
+            first,
+            order.into_iter(),
+            axes,
+            Rows::Dense { starts },
+        )
+    }
+
+    fn sorted(
+        positions: &[[T; D]],
+        first: usize,
+        order: impl Iterator<Item = u32> + Clone,
+        axes: [Axis; D],
+        rows: Rows<D>,
+    ) -> Self {
         Self {
             axes,
-            rows: Rows::Dense { starts, cell },
-            coords,
-            index,
+            rows,
+            coords: std::array::from_fn(|a| {
+                order
+                    .clone()
+                    .map(|i| positions[i as usize][a])
+                    .chain([T::default(); BLOCK])
+                    .collect()
+            }),
+            index: order
+                .map(|i| first as i32 + i as i32)
+                .chain([0; BLOCK])
+                .collect(),
         }
     }
 
@@ -212,44 +226,64 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
             }
         }
         starts.push(order.len() as u32);
-        let at = |slot: usize| order[slot].1 as usize;
-        let n = order.len();
-        Self {
-            axes,
-            rows: Rows::Sparse {
-                keys,
-                starts,
-                x: order.iter().map(|(key, _)| key[D - 1]).collect(),
-            },
-            coords: std::array::from_fn(|a| (0..n).map(|s| positions[at(s)][a]).collect()),
-            index: (0..n).map(|s| (first + at(s)) as i32).collect(),
-        }
+        let x = order.iter().map(|(key, _)| key[D - 1]).collect();
+        let rows = Rows::Sparse { keys, starts, x };
+        Self::sorted(positions, first, order.iter().map(|&(_, i)| i), axes, rows)
+    }
+
+    /// The caller's indices of the sorted particles.
+    pub fn index(&self) -> &[i32] {
+        &self.index[..self.index.len() - BLOCK]
+    }
+
+    /// A lower bound of the number of ordered pairs, no particle with itself, that are
+    /// at most `radius` apart, from the occupation of the cells alone.
+    ///
+    /// A cell can be cut into p boxes with no diagonal longer than the radius. All pairs
+    /// within a box are near, and n particles in p boxes make at least n^2 / p of them.
+    pub fn pairs_at_least(&self, radius: f64) -> usize {
+        let boxes: f64 = self
+            .axes
+            .iter()
+            .map(|axis| ((D as f64).sqrt() / (axis.cells_per_length * radius)).ceil())
+            .product();
+        let square = |n: usize| (n * n) as f64;
+        let pairs: f64 = match &self.rows {
+            Rows::Dense { starts } => starts
+                .windows(2)
+                .map(|cell| square((cell[1] - cell[0]) as usize))
+                .sum(),
+            Rows::Sparse { starts, x, .. } => starts
+                .windows(2)
+                .flat_map(|row| x[row[0] as usize..row[1] as usize].chunk_by(u64::eq))
+                .map(|cell| square(cell.len()))
+                .sum(),
+        };
+        ((pairs / boxes) as usize).saturating_sub(self.index().len())
     }
 
     /// Calls `visit(receivers, candidates)` for the particles of each occupied cell
-    /// among the sorted particles `slots`, in order: the candidates are the runs of
-    /// sorted particles that hold every particle within the cutoff of any receiver,
-    /// each once.
+    /// among the sorted particles `slots`, in order, until it returns false: the
+    /// candidates are the runs of sorted particles that hold every particle within the
+    /// cutoff of any receiver, each once.
+    #[inline(always)]
     pub fn for_each_cell(
         &self,
         slots: Range<usize>,
-        mut visit: impl FnMut(Range<usize>, &[Range<usize>]),
+        mut visit: impl FnMut(Range<usize>, &[Range<usize>]) -> bool,
     ) {
-        if slots.is_empty() {
-            return;
-        }
         let mut slot = slots.start;
-        let mut row = self.rows.row_of(slot, &self.axes);
-        let mut row_end = 0;
+        let (mut row, mut row_end, mut x) = (0, 0, 0);
         let mut neighbours = Vec::new();
         let mut candidates = Vec::new();
         while slot < slots.end {
             if slot >= row_end {
                 row = self.rows.row_of(slot, &self.axes);
+                x = 0;
                 row_end = self.rows.cell_start(row, self.axes[0].count, &self.axes);
                 self.neighbour_rows(row, &mut neighbours);
             }
-            let x = self.rows.x_of(row, slot, &self.axes);
+            x = self.rows.x_of(row, slot, x, &self.axes);
             let end = self.rows.cell_start(row, x + 1, &self.axes).min(slots.end);
             candidates.clear();
             for run in self.axes[0].within_reach(x) {
@@ -260,7 +294,9 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
                     }));
                 }
             }
-            visit(slot..end, &candidates);
+            if !visit(slot..end, &candidates) {
+                return;
+            }
             slot = end;
         }
     }
@@ -306,17 +342,20 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
 impl<const D: usize> Rows<D> {
     /// The row that holds a particle.
     fn row_of(&self, slot: usize, axes: &[Axis; D]) -> usize {
+        let starting = |starts: &[u32]| starts.partition_point(|&s| s as usize <= slot) - 1;
         match self {
-            Rows::Dense { cell, .. } => cell[slot] as usize / axes[0].count as usize,
-            Rows::Sparse { starts, .. } => starts.partition_point(|&s| s as usize <= slot) - 1,
+            Rows::Dense { starts } => starting(starts) / axes[0].count as usize,
+            Rows::Sparse { starts, .. } => starting(starts),
         }
     }
 
-    /// The cell along x of a particle in `row`.
+    /// The cell along x of a particle in `row`, which is not before `from`.
     #[inline(always)]
-    fn x_of(&self, row: usize, slot: usize, axes: &[Axis; D]) -> u64 {
+    fn x_of(&self, row: usize, slot: usize, from: u64, axes: &[Axis; D]) -> u64 {
         match self {
-            Rows::Dense { cell, .. } => u64::from(cell[slot]) - row as u64 * axes[0].count,
+            Rows::Dense { .. } => (from..)
+                .find(|&x| self.cell_start(row, x + 1, axes) > slot)
+                .expect("a row ends after its particles"),
             Rows::Sparse { x, .. } => x[slot],
         }
     }
@@ -325,9 +364,7 @@ impl<const D: usize> Rows<D> {
     #[inline(always)]
     fn cell_start(&self, row: usize, x: u64, axes: &[Axis; D]) -> usize {
         match self {
-            Rows::Dense { starts, .. } => {
-                starts[row * axes[0].count as usize + x as usize] as usize
-            }
+            Rows::Dense { starts } => starts[row * axes[0].count as usize + x as usize] as usize,
             Rows::Sparse {
                 starts, x: cells, ..
             } => {

@@ -114,7 +114,7 @@ pub(super) fn check_length(
 
 fn graphs(ptr: Option<&[i64]>, particles: usize) -> Result<Vec<Range<usize>>, Error> {
     let Some(ptr) = ptr else {
-        return Ok(vec![0..particles]);
+        return Ok(std::iter::once(0..particles).collect());
     };
     let fail = |problem: String| {
         Err(Error::invalid(

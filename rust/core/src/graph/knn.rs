@@ -12,7 +12,7 @@ use super::grid::{bounds, wrap};
 use super::input::{Batch, Options, Particles};
 use super::memory::Budget;
 use super::order::RANKED;
-use super::radius::distance2;
+use super::radius::separation;
 use super::scalar::Scalar;
 use crate::Error;
 use crate::threads;
@@ -23,7 +23,7 @@ use crate::threads;
 /// # Errors
 /// [`Error::InvalidArgument`] for arguments outside what is accepted,
 /// [`Error::OutOfMemory`] if the edges would not fit in the memory there is.
-pub fn knn_graph<T: Scalar + Nearest>(
+pub fn knn_graph<T: Nearest>(
     particles: &Particles<'_, T>,
     k: usize,
     options: &Options,
@@ -38,7 +38,7 @@ pub fn knn_graph<T: Scalar + Nearest>(
 /// Locations searched as one task.
 const TASK: usize = 512;
 
-fn build<T: Scalar + Nearest, const D: usize>(
+fn build<T: Nearest, const D: usize>(
     batch: &Batch<'_, T, D>,
     k: usize,
     options: &Options,
@@ -55,10 +55,10 @@ fn build<T: Scalar + Nearest, const D: usize>(
     }
     let count = batch.positions.len();
     let budget = Budget::default();
-    budget.charge(count.saturating_mul(k + 1))?;
+    budget.check(count * k)?;
     let threads = options.threads.unless(count < 2 * TASK);
-    let searches = threads::map(threads, batch.graphs.len(), |b| {
-        Search::new(batch, batch.graphs[b].clone(), k)
+    let searches = threads::map(threads, batch.graphs.clone(), |graph| {
+        Search::new(batch, graph, k)
     })
     .into_iter()
     .collect::<Result<Vec<_>, _>>()?;
@@ -71,9 +71,8 @@ fn build<T: Scalar + Nearest, const D: usize>(
                 .map(move |start| (search, start..n.min(start + TASK)))
         })
         .collect();
-    let found = threads::map(threads, tasks.len(), |t| {
-        let (search, locations) = &tasks[t];
-        search.run(locations.clone(), options.self_edges, &budget)
+    let found = threads::map(threads, tasks.clone(), |(search, locations)| {
+        search.run(locations, options.self_edges, &budget)
     })
     .into_iter()
     .collect::<Result<Vec<_>, _>>()?;
@@ -82,7 +81,7 @@ fn build<T: Scalar + Nearest, const D: usize>(
         .map(|(search, locations)| search.members_of(locations.clone()))
         .zip(&found)
         .collect();
-    edges::assemble(count, &parts, threads)
+    edges::assemble(count, &parts, threads, &budget)
 }
 
 /// One graph. Particles at the same place are one location, so that a pile of them
@@ -100,7 +99,7 @@ struct Search<T: Nearest, const D: usize> {
     tree_period: Option<[T; D]>,
 }
 
-impl<T: Scalar + Nearest, const D: usize> Search<T, D> {
+impl<T: Nearest, const D: usize> Search<T, D> {
     fn new(batch: &Batch<'_, T, D>, graph: Range<usize>, k: usize) -> Result<Self, Error> {
         let first = graph.start;
         let positions: Vec<[T; D]> = batch.positions[graph]
@@ -226,7 +225,11 @@ impl<T: Scalar + Nearest, const D: usize> Search<T, D> {
     }
 
     fn distance2(&self, here: [T; D], location: u32) -> T {
-        distance2::<T, D, true>(here, self.locations[location as usize], &self.period)
+        let there = self.locations[location as usize];
+        (0..D).fold(T::default(), |sum, a| {
+            let d = separation::<T, true>(here[a], there[a], self.period[a]);
+            sum + d * d
+        })
     }
 }
 

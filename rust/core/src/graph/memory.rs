@@ -1,5 +1,6 @@
 //! How many edges there is room for.
 
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::Error;
@@ -16,37 +17,31 @@ const UNASKED: usize = 1 << 22;
 #[derive(Default)]
 pub(super) struct Budget {
     edges: AtomicUsize,
-    /// Room for edges; 0 until somebody asks.
-    room: AtomicUsize,
+    room: OnceLock<usize>,
 }
 
 impl Budget {
-    /// Adds `edges`, or fails if there is no room for that many.
+    /// Counts `edges` more, or fails if there is no room for them.
     pub fn charge(&self, edges: usize) -> Result<(), Error> {
-        let total = self.edges.fetch_add(edges, Ordering::Relaxed) + edges;
-        if total <= UNASKED || total <= self.room() {
+        self.check(self.edges.fetch_add(edges, Ordering::Relaxed) + edges)
+    }
+
+    /// Fails if there is no room for a graph of at least `edges` edges.
+    pub fn check(&self, edges: usize) -> Result<(), Error> {
+        let room = || {
+            *self
+                .room
+                .get_or_init(|| available_memory() / BYTES_PER_EDGE)
+        };
+        if edges <= UNASKED || edges <= room() {
             return Ok(());
         }
-        Err(too_many(total, self.room()))
+        Err(Error::OutOfMemory(format!(
+            "the graph has at least {edges} edges and the available memory holds {}; \
+             use a smaller radius or fewer particles",
+            room()
+        )))
     }
-
-    fn room(&self) -> usize {
-        let room = self.room.load(Ordering::Relaxed);
-        if room > 0 {
-            return room;
-        }
-        let room = (available_memory() / BYTES_PER_EDGE).max(1);
-        self.room.store(room, Ordering::Relaxed);
-        room
-    }
-}
-
-/// The error for at least `edges` edges where there is room for `room`.
-pub(super) fn too_many(edges: usize, room: usize) -> Error {
-    Error::OutOfMemory(format!(
-        "the graph has at least {edges} edges, and the available memory holds {room}; \
-         use a smaller radius or fewer particles"
-    ))
 }
 
 /// Bytes the machine, or the control group of this process, can still give; without

@@ -12,7 +12,8 @@ pub(super) fn sort_row(found: &mut [i32], n: usize, dropped: i32, sorted: &mut [
     match n {
         0..=8 => rank::<8>(found, n, dropped, sorted),
         9..=16 => rank::<16>(found, n, dropped, sorted),
-        17..=RANKED => rank::<RANKED>(found, n, dropped, sorted),
+        17..=24 => rank::<24>(found, n, dropped, sorted),
+        25..=RANKED => rank::<RANKED>(found, n, dropped, sorted),
         _ => {
             let found = &mut found[..n];
             found.sort_unstable();
@@ -25,23 +26,23 @@ pub(super) fn sort_row(found: &mut [i32], n: usize, dropped: i32, sorted: &mut [
 }
 
 /// Each sender's place is the number of smaller ones. Quadratic, but without a branch
-/// that could be mispredicted, and four comparisons to an instruction.
+/// that could be mispredicted, and several comparisons to an instruction.
 #[inline(always)]
 fn rank<const W: usize>(found: &[i32], n: usize, dropped: i32, sorted: &mut [i32]) {
     let found: &[i32; W] = found.first_chunk().expect("room for a block");
-    let mut keys = [0; W];
-    for (l, key) in keys.iter_mut().enumerate() {
-        // What is dropped sorts last, where it is not counted.
+    let sorted: &mut [i32; RANKED] = sorted.first_chunk_mut().expect("room for a block");
+    // What is dropped or lies past the end comes last, where nothing is counted.
+    let keys: [i32; W] = std::array::from_fn(|l| {
         let absent = (l >= n) | (found[l] == dropped);
-        *key = if absent { i32::MAX } else { found[l] };
-    }
+        if absent { i32::MAX } else { found[l] }
+    });
     let mut places = [0_u32; W];
-    for &other in &keys[..n] {
+    for other in keys {
         for (place, &key) in places.iter_mut().zip(&keys) {
             *place += u32::from(key > other);
         }
     }
-    for (&place, &key) in places.iter().zip(&keys).take(n) {
-        sorted[place as usize] = key;
+    for (&place, &key) in places.iter().zip(&keys) {
+        sorted[place as usize % RANKED] = key;
     }
 }

@@ -8,6 +8,9 @@ mod sealed {
     impl Sealed for f64 {}
 }
 
+/// Numbers that are compared together.
+pub(super) const BLOCK: usize = 8;
+
 /// `f32` or `f64`: what positions and uncertainties are given in, and the arithmetic
 /// that decides about an edge.
 pub trait Scalar:
@@ -47,10 +50,15 @@ pub trait Scalar:
     fn is_normal(self) -> bool;
     /// A total order, the usual one for numbers that are not NaN.
     fn total_cmp(&self, other: &Self) -> std::cmp::Ordering;
+    /// One bit per place, set where the value is at most its limit; the first place is
+    /// the lowest bit. On x86-64 it is spelt in vector instructions, which the compiler
+    /// does not find by itself.
+    #[doc(hidden)]
+    fn at_most(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8;
 }
 
 macro_rules! scalar {
-    ($kind:ident, $name:literal) => {
+    ($kind:ident, $name:literal, $per:literal, $load:ident, $compare:ident, $mask:ident) => {
         impl Scalar for $kind {
             const INFINITY: Self = $kind::INFINITY;
             const EPSILON: f64 = $kind::EPSILON as f64;
@@ -88,9 +96,41 @@ macro_rules! scalar {
             fn total_cmp(&self, other: &Self) -> std::cmp::Ordering {
                 self.total_cmp(other)
             }
+            #[inline(always)]
+            fn at_most(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8 {
+                #[cfg(target_arch = "x86_64")]
+                {
+                    use std::arch::x86_64::{$compare, $load, $mask};
+                    let (values, limits) = (values.as_chunks::<$per>(), limits.as_chunks::<$per>());
+                    let chunks = values.0.iter().zip(limits.0).rev();
+                    chunks.fold(0, |bits, (values, limits)| {
+                        let (values, limits) = (values.as_ptr(), limits.as_ptr());
+                        // SAFETY: every x86-64 processor has these instructions, and the
+                        // loads read the chunks they point to.
+                        let mask = unsafe { $mask($compare($load(values), $load(limits))) };
+                        bits << $per | mask as u8
+                    })
+                }
+                #[cfg(not(target_arch = "x86_64"))]
+                (0..BLOCK).fold(0, |bits, l| bits | u8::from(values[l] <= limits[l]) << l)
+            }
         }
     };
 }
 
-scalar!(f32, "float32");
-scalar!(f64, "float64");
+scalar!(
+    f32,
+    "float32",
+    4,
+    _mm_loadu_ps,
+    _mm_cmple_ps,
+    _mm_movemask_ps
+);
+scalar!(
+    f64,
+    "float64",
+    2,
+    _mm_loadu_pd,
+    _mm_cmple_pd,
+    _mm_movemask_pd
+);
