@@ -19,7 +19,6 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 /// Connect all particles that are at most a radius apart.
 #[pyfunction]
 #[pyo3(signature = (pos, r, *, ptr=None, r#box=None, self_edges=false, threads=None, return_offsets=false))]
-#[expect(clippy::too_many_arguments, reason = "keyword arguments in Python")]
 fn radius_graph<'py>(
     pos: &Bound<'py, PyAny>,
     r: &Bound<'py, PyAny>,
@@ -84,7 +83,6 @@ fn adaptive_graph<'py>(
 /// Connect every particle to its k nearest others.
 #[pyfunction]
 #[pyo3(signature = (pos, k, *, ptr=None, r#box=None, self_edges=false, threads=None, return_offsets=false))]
-#[expect(clippy::too_many_arguments, reason = "keyword arguments in Python")]
 fn knn_graph<'py>(
     pos: &Bound<'py, PyAny>,
     k: &Bound<'py, PyAny>,
