@@ -12,6 +12,7 @@ const WATER: Material = Material::Water(Water {
     sound_speed: 14.0,
     exponent: 7.0,
     viscosity: 0.003,
+    bulk_viscosity: 0.1,
     cohesion: 0.05,
 });
 
@@ -129,8 +130,8 @@ fn a_collision_in_the_air_conserves_mass_and_momentum() {
 fn water_at_rest_keeps_its_volume_and_rests() {
     let depth = 0.2;
     let mut simulation = simulation(WATER, lattice([0.1, 0.1], [0.9, 0.1 + depth], [0.0; 2]));
-    for _ in 0..10 {
-        run(&mut simulation, 100);
+    for _ in 0..20 {
+        run(&mut simulation, 50);
         let volume = 2.0 * (mean(&simulation, 1) - BOX.low) / depth;
         assert!((volume - 1.0).abs() < 0.05, "volume {volume}");
         let level = surface(&simulation);
@@ -141,8 +142,12 @@ fn water_at_rest_keeps_its_volume_and_rests() {
             );
         }
     }
-    let speed = fastest(&simulation);
-    assert!(speed < 0.05, "{speed} m/s");
+    // The settling of the first moments has died out, not merely paused between swings.
+    for _ in 0..40 {
+        simulation.advance_frame();
+        let speed = fastest(&simulation);
+        assert!(speed < 0.01, "{speed} m/s");
+    }
 }
 
 #[test]
@@ -186,7 +191,7 @@ fn energy_never_grows() {
                 before = now;
             }
             assert!(
-                worst < 1e-3,
+                worst < 1e-9,
                 "{scene:?} {seed}: {worst} of the energy in a frame"
             );
             assert!(before < start, "{scene:?} {seed}");
@@ -205,6 +210,7 @@ fn a_slab_across_a_slippery_box_moves_as_in_two_dimensions() {
         sound_speed: 14.0,
         exponent: 7.0,
         viscosity: 0.0,
+        bulk_viscosity: 0.0,
         cohesion: 0.05,
     });
     let place = |index: usize| spacing * (index as f64 + 0.5);

@@ -34,8 +34,11 @@ pub struct Water {
     pub sound_speed: f64,
     /// Exponent γ.
     pub exponent: f64,
-    /// Kinematic viscosity \[m²/s\].
+    /// Kinematic shear viscosity \[m²/s\].
     pub viscosity: f64,
+    /// Kinematic bulk viscosity \[m²/s\], far above that of real water: it silences
+    /// the sound of an impact, which would ring on for seconds.
+    pub bulk_viscosity: f64,
     /// Largest expansion that water resists and remembers, as a logarithm of volume.
     /// What is torn further apart is spray, as good as at rest when it meets water again.
     pub cohesion: f64,
@@ -92,6 +95,15 @@ impl Material {
         }
     }
 
+    /// Largest constant kinematic viscosity \[m²/s\] of a deformation. That of sand varies
+    /// with the pressure and never more than doubles it, which is no limit to the step.
+    pub(crate) fn viscosity(&self) -> f64 {
+        match self {
+            Self::Water(water) => water.bulk_viscosity + 2.0 * water.viscosity,
+            Self::Sand(_) => 0.0,
+        }
+    }
+
     pub(crate) fn contact(&self) -> Contact {
         match self {
             Self::Water(_) => Contact::Slip,
@@ -132,7 +144,8 @@ impl Water {
         let divergence = linalg::trace(velocity_gradient);
         history.log_volume = (history.log_volume + dt * divergence).min(self.cohesion);
         let modulus = self.sound_speed.powi(2) / self.exponent;
-        let pressure = modulus * ((-self.exponent * history.log_volume).exp() - 1.0);
+        let pressure = modulus * ((-self.exponent * history.log_volume).exp() - 1.0)
+            - (self.bulk_viscosity - 2.0 / D as f64 * self.viscosity) * divergence;
         // Kirchhoff stress is Cauchy stress times the volume ratio.
         let volume = history.log_volume.exp();
         let mut stress = linalg::zero();
@@ -141,7 +154,7 @@ impl Water {
                 stress[i][j] =
                     volume * self.viscosity * (velocity_gradient[i][j] + velocity_gradient[j][i]);
             }
-            stress[i][i] -= volume * (2.0 / D as f64 * self.viscosity * divergence + pressure);
+            stress[i][i] -= volume * pressure;
         }
         stress
     }
@@ -224,6 +237,7 @@ mod tests {
         sound_speed: 14.0,
         exponent: 7.0,
         viscosity: 0.0,
+        bulk_viscosity: 0.0,
         cohesion: 0.05,
     };
     const SAND: Sand = Sand {

@@ -139,6 +139,7 @@ impl Scene {
                     sound_speed: 14.0,
                     exponent: 7.0,
                     viscosity: 0.003,
+                    bulk_viscosity: 0.1,
                     cohesion: 0.05,
                 }),
                 particle_type: 5,
