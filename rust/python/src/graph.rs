@@ -16,7 +16,44 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(knn_graph, module)?)
 }
 
-/// Connect all particles that are at most a radius apart.
+/// Connect all particles that are at most a radius apart, in both directions.
+///
+/// Distances are computed in the type of ``pos``. A pair within rounding of the radius may
+/// fall either way; both directions fall the same way.
+///
+/// Parameters
+/// ----------
+/// pos : float32 or float64 array ``[N, d]``
+///     Positions, ``d`` 2 or 3. Any strides; only what is not contiguous is copied.
+/// r : float, or float array ``[N]``
+///     The radius in the unit of ``pos``, or one per particle: an edge wherever
+///     ``distance <= max(r[i], r[j])``.
+/// ptr : int64 array ``[B + 1]``, optional
+///     Graph ``b`` of a batch holds the particles ``ptr[b]:ptr[b + 1]``; no edge joins two
+///     graphs. One graph if absent.
+/// box : d lengths, optional
+///     Period of each axis, ``inf`` or 0 for an open one. A pair counts once, at its
+///     nearest image.
+/// self_edges : bool
+///     Whether every particle is also its own neighbour.
+/// threads : int, optional
+///     How many threads may work on the call, all cores if absent. The result is the same.
+/// return_offsets : bool
+///     Whether to return the receivers' row offsets too.
+///
+/// Returns
+/// -------
+/// edge_index : int64 array ``[2, E]``
+///     Row 0 the senders, row 1 the receivers, sorted by receiver, then by sender.
+/// offsets : int64 array ``[N + 1]``, if asked for
+///     Particle ``i`` receives the edges ``offsets[i]:offsets[i + 1]``.
+///
+/// Raises
+/// ------
+/// ValueError, TypeError
+///     For an argument of the wrong value or kind, with its name and what is accepted.
+/// MemoryError
+///     If the edges would not fit in the memory there is.
 #[pyfunction]
 #[pyo3(signature = (pos, r, *, ptr=None, r#box=None, self_edges=false, threads=None, return_offsets=false))]
 fn radius_graph<'py>(
@@ -45,7 +82,54 @@ fn radius_graph<'py>(
     }
 }
 
-/// Connect all particles within a radius, and those that were uncertain within a larger one.
+/// Connect all particles within a radius, and those that are uncertain within a larger one.
+///
+/// A particle is high if its sigma exceeds the ``tau``-th percentile of its graph
+/// (``numpy.percentile``, linear). An edge where ``distance <= r``, or where
+/// ``distance <= factor * r`` and at least one end is high. ``factor = 1``, ``tau = 100``
+/// or equal sigma give the base graph.
+///
+/// Parameters
+/// ----------
+/// pos : float32 or float64 array ``[N, d]``
+///     Positions, ``d`` 2 or 3. Any strides; only what is not contiguous is copied.
+/// sigma : float32 or float64 array ``[N]``
+///     Uncertainty of each particle, not negative.
+/// r : float
+///     The base radius in the unit of ``pos``.
+/// tau : float
+///     Percentile, 0 to 100.
+/// factor : float
+///     How many times the base radius a high particle sees, at least 1.
+/// eligible : bool array ``[N]``, optional
+///     The particles over which the percentile is taken; the others are never high. All if
+///     absent.
+/// ptr : int64 array ``[B + 1]``, optional
+///     Graph ``b`` of a batch holds the particles ``ptr[b]:ptr[b + 1]``; no edge joins two
+///     graphs. One graph if absent.
+/// box : d lengths, optional
+///     Period of each axis, ``inf`` or 0 for an open one. A pair counts once, at its
+///     nearest image.
+/// self_edges : bool
+///     Whether every particle is also its own neighbour.
+/// threads : int, optional
+///     How many threads may work on the call, all cores if absent. The result is the same.
+/// return_offsets : bool
+///     Whether to return the receivers' row offsets too.
+///
+/// Returns
+/// -------
+/// edge_index : int64 array ``[2, E]``
+///     Row 0 the senders, row 1 the receivers, sorted by receiver, then by sender.
+/// offsets : int64 array ``[N + 1]``, if asked for
+///     Particle ``i`` receives the edges ``offsets[i]:offsets[i + 1]``.
+///
+/// Raises
+/// ------
+/// ValueError, TypeError
+///     For an argument of the wrong value or kind, with its name and what is accepted.
+/// MemoryError
+///     If the edges would not fit in the memory there is.
 #[pyfunction]
 #[pyo3(signature = (pos, sigma, r, tau, factor, *, eligible=None, ptr=None, r#box=None, self_edges=false, threads=None, return_offsets=false))]
 #[expect(clippy::too_many_arguments, reason = "keyword arguments in Python")]
@@ -80,7 +164,42 @@ fn adaptive_graph<'py>(
     }))
 }
 
-/// Connect every particle to its k nearest others.
+/// Let every particle receive from its k nearest others, ties going to the lower index.
+///
+/// The graph is not symmetric. A self-edge, if asked for, comes beside the ``k``.
+///
+/// Parameters
+/// ----------
+/// pos : float32 or float64 array ``[N, d]``
+///     Positions, ``d`` 2 or 3. Any strides; only what is not contiguous is copied.
+/// k : int
+///     Senders of each receiver, at least 1 and less than the particles of any graph.
+/// ptr : int64 array ``[B + 1]``, optional
+///     Graph ``b`` of a batch holds the particles ``ptr[b]:ptr[b + 1]``; no edge joins two
+///     graphs. One graph if absent.
+/// box : d lengths, optional
+///     Period of each axis, ``inf`` or 0 for an open one. A pair counts once, at its
+///     nearest image.
+/// self_edges : bool
+///     Whether every particle is also its own neighbour.
+/// threads : int, optional
+///     How many threads may work on the call, all cores if absent. The result is the same.
+/// return_offsets : bool
+///     Whether to return the receivers' row offsets too.
+///
+/// Returns
+/// -------
+/// edge_index : int64 array ``[2, E]``
+///     Row 0 the senders, row 1 the receivers, sorted by receiver, then by sender.
+/// offsets : int64 array ``[N + 1]``, if asked for
+///     Particle ``i`` receives the edges ``offsets[i]:offsets[i + 1]``.
+///
+/// Raises
+/// ------
+/// ValueError, TypeError
+///     For an argument of the wrong value or kind, with its name and what is accepted.
+/// MemoryError
+///     If the edges would not fit in the memory there is.
 #[pyfunction]
 #[pyo3(signature = (pos, k, *, ptr=None, r#box=None, self_edges=false, threads=None, return_offsets=false))]
 fn knn_graph<'py>(

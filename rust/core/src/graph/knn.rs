@@ -95,8 +95,10 @@ struct Search<T: Nearest, const D: usize> {
     starts: Vec<u32>,
     tree: ImmutableKdTree<T, D>,
     period: [T; D],
-    /// The period the tree is told, which must be finite.
-    tree_period: Option<[T; D]>,
+    /// The locations as the tree has them.
+    in_tree: Vec<[T; D]>,
+    /// The box the tree is told to repeat.
+    tree_box: Option<[T; D]>,
 }
 
 impl<T: Nearest, const D: usize> Search<T, D> {
@@ -136,24 +138,40 @@ impl<T: Nearest, const D: usize> Search<T, D> {
             }
         }
         starts.push(order.len() as u32);
-        let tree_period = batch
-            .period
+        // Where an axis is periodic, the tree wants a box that holds all points and has a
+        // finite length on every axis: one of four times the extent is too long on an
+        // open axis for any image to be nearer.
+        let periodic = batch.period.iter().any(|length| length.is_finite());
+        let span = batch.period.map(|length| {
+            if length.is_finite() {
+                length
+            } else {
+                T::from_f64(4.0 * extent + 1.0)
+            }
+        });
+        let in_tree = locations
             .iter()
-            .any(|length| length.is_finite())
-            .then(|| {
-                // Four times the extent is too long for any image to be nearer.
-                batch
-                    .period
-                    .map(|length| length.lesser(T::from_f64(4.0 * extent + 1.0)))
-            });
+            .map(|location: &[T; D]| {
+                std::array::from_fn(|a| {
+                    let open = periodic && !batch.period[a].is_finite();
+                    location[a]
+                        - if open {
+                            T::from_f64(low[a])
+                        } else {
+                            T::default()
+                        }
+                })
+            })
+            .collect::<Vec<_>>();
         Ok(Self {
             k,
-            tree: T::tree(&locations),
+            tree: T::tree(&in_tree),
+            in_tree,
             locations,
             members: order.into_iter().map(|i| first as i32 + i as i32).collect(),
             starts,
             period: batch.period,
-            tree_period,
+            tree_box: periodic.then_some(span),
         })
     }
 
@@ -189,26 +207,35 @@ impl<T: Nearest, const D: usize> Search<T, D> {
     /// The `k + 1` particles nearest to a location, its own among them, with squared
     /// distances and ordered by them, then by index.
     fn nearest(&self, location: usize, nearest: &mut Vec<(T, i32)>) {
-        let here = self.locations[location];
+        let (here, query) = (self.locations[location], &self.in_tree[location]);
         // One location more than could be needed shows whether the last place is tied.
         let asked = self.k + 2;
-        let found = T::nearest(&self.tree, &here, self.tree_period.as_ref(), asked);
+        let found = T::nearest(&self.tree, query, self.tree_box.as_ref(), asked);
         self.rank(here, &found, nearest);
         if found.len() == self.locations.len() {
             return;
         }
-        // The tree's arithmetic may round differently.
         let farthest = found
             .iter()
-            .map(|&l| self.distance2(here, l))
+            .map(|&location| self.distance2(here, location))
             .fold(T::default(), T::greater);
-        let certain = farthest * T::from_f64(1.0 - 8.0 * T::EPSILON);
+        let [certain, reach] = self.around(farthest);
         if nearest.len() > self.k && nearest[self.k].0 < certain {
             return;
         }
-        let reach = farthest * T::from_f64(1.0 + 8.0 * T::EPSILON);
-        let found = T::within(&self.tree, &here, self.tree_period.as_ref(), reach);
+        let found = T::within(&self.tree, query, self.tree_box.as_ref(), reach);
         self.rank(here, &found, nearest);
+    }
+
+    /// Bounds of what the tree may hold a squared distance for, which it rounds in other
+    /// ways and places: by a few units at each of its levels, and in a box by units of
+    /// the box.
+    fn around(&self, distance2: T) -> [T; 2] {
+        let lengths = self.tree_box.iter().flatten();
+        let longest = lengths.fold(0.0, |longest, length| length.to_f64().max(longest));
+        let distance = distance2.to_f64().sqrt();
+        let slack = T::EPSILON * (64.0 * distance + 16.0 * longest);
+        [distance - slack, distance + slack].map(|d| T::from_f64(d.max(0.0).powi(2)))
     }
 
     fn rank(&self, here: [T; D], found: &[u32], nearest: &mut Vec<(T, i32)>) {
