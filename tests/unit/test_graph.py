@@ -1,5 +1,6 @@
 """The graph builders against scipy and numpy, and as citizens of a Python process."""
 
+import itertools
 import threading
 import warnings
 from typing import Any
@@ -94,8 +95,7 @@ def test_each_graph_of_a_batch_has_its_own_percentile() -> None:
     sigma = rng.random(400) * np.repeat([1.0, 100.0], [150, 250])
     ptr = np.array([0, 150, 150, 400])
     parts = [
-        adaptive_graph(pos[a:b], sigma[a:b], 0.1, 70, 1.5) + a
-        for a, b in zip(ptr[:-1], ptr[1:], strict=True)
+        adaptive_graph(pos[a:b], sigma[a:b], 0.1, 70, 1.5) + a for a, b in itertools.pairwise(ptr)
     ]
     batch = adaptive_graph(pos, sigma, 0.1, 70, 1.5, ptr=ptr)
     np.testing.assert_array_equal(batch, np.concatenate(parts, axis=1))
