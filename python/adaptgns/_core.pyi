@@ -4,6 +4,8 @@ from typing import Literal, TypeAlias, overload
 import numpy as np
 import numpy.typing as npt
 
+__all__ = ["adaptive_graph", "knn_graph", "radius_graph", "simulate"]
+
 _Reals: TypeAlias = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 _Integers: TypeAlias = npt.NDArray[np.int64]
 _Lengths: TypeAlias = Sequence[float] | _Reals
