@@ -200,12 +200,17 @@ def test_interrupting_ends_with_one_line_and_nothing_half_done(tmp_path: Path) -
         [*command, "--out", str(tmp_path), "--train", "1000000"],
         stderr=subprocess.PIPE,
         text=True,
+        # A shell's background jobs, and with them this test in one, are born deaf to SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     )
     while not (tmp_path / "train.h5.partial").exists():
         assert process.poll() is None
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate()
+    try:
+        _, told = process.communicate(timeout=120)
+    finally:
+        process.kill()
     assert process.returncode == 130
     assert told.strip().splitlines()[-1].startswith("interrupted; the same command goes on")
     assert "Traceback" not in told
