@@ -58,13 +58,13 @@ class StoreWriter:
         try:
             # Not "w", which would empty the file of another process before finding it locked.
             self._file = h5py.File(self._partial, "x")
+            if origin is not None:
+                self._file.attrs[_ORIGIN] = origin
         except FileExistsError as error:
             raise DataError(f"{self._partial}: another process is writing it") from error
-        except OSError:
+        except BaseException:  # an interruption, too
             self._partial.unlink(missing_ok=True)
             raise
-        if origin is not None:
-            self._file.attrs[_ORIGIN] = origin
 
     def append(self, trajectory: Trajectory) -> None:
         """Adds a trajectory; its group is numbered, whatever its name.
