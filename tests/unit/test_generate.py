@@ -203,7 +203,8 @@ def test_interrupting_ends_with_one_line_and_nothing_half_done(tmp_path: Path) -
         # A shell's background jobs, and with them this test in one, are born deaf to SIGINT.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     )
-    while not (tmp_path / "train.h5.partial").exists():
+    partial = tmp_path / "train.h5.partial"
+    while not partial.exists() or partial.stat().st_size < 1 << 20:  # trajectories are written
         assert process.poll() is None
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
