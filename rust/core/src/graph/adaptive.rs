@@ -2,8 +2,9 @@
 
 use super::Graph;
 use super::input::{Options, Particles, check_length, check_values};
-use super::radius::{Cutoff, check_radius, within_cutoff};
+use super::radius::{check_radius, within_cutoff};
 use super::scalar::Scalar;
+use super::search::Cutoff;
 use crate::Error;
 
 /// Which particles see farther, and how much.

@@ -4,11 +4,11 @@ use std::mem::MaybeUninit;
 
 use super::Graph;
 use super::memory::Budget;
-use super::order::{RANKED, sort_row};
+use super::order::write_sorted;
 use crate::Error;
 use crate::threads::{self, Threads};
 
-/// The senders of some receivers, row after row.
+/// The senders of some receivers, row after row, each in any order.
 pub(super) struct Rows {
     /// Has room for what is to come at its end.
     senders: Vec<i32>,
@@ -18,44 +18,43 @@ pub(super) struct Rows {
     counts: Vec<u32>,
 }
 
+/// Room that there always is behind a row.
+const ROOM: usize = 8;
+
 impl Rows {
     pub fn with_receivers(receivers: usize) -> Self {
         Self {
-            senders: vec![0; 8 * receivers + RANKED],
+            senders: vec![0; 8 * receivers + ROOM],
             used: 0,
             charged: 0,
             counts: Vec::with_capacity(receivers),
         }
     }
 
-    /// Adds a row of the `n` senders at the front of `found`, sorted and without
-    /// `dropped`; see [`sort_row`].
+    /// The place of the next row, with room for `most` senders.
     #[inline(always)]
-    pub fn push(
-        &mut self,
-        found: &mut [i32],
-        n: usize,
-        dropped: i32,
-        budget: &Budget,
-    ) -> Result<(), Error> {
-        if self.used + n + RANKED > self.senders.len() {
-            self.grow(n, budget)?;
+    pub fn next(&mut self, most: usize, budget: &Budget) -> Result<&mut [i32], Error> {
+        if self.used + most + ROOM > self.senders.len() {
+            self.grow(most, budget)?;
         }
-        sort_row(found, n, dropped, &mut self.senders[self.used..]);
-        let kept = n - usize::from(dropped >= 0);
-        self.used += kept;
-        self.counts.push(kept as u32);
-        Ok(())
+        Ok(&mut self.senders[self.used..])
+    }
+
+    /// Ends the next row behind its first `n` senders.
+    #[inline(always)]
+    pub fn finish(&mut self, n: usize) {
+        self.used += n;
+        self.counts.push(n as u32);
     }
 
     #[cold]
-    fn grow(&mut self, n: usize, budget: &Budget) -> Result<(), Error> {
+    fn grow(&mut self, most: usize, budget: &Budget) -> Result<(), Error> {
         budget.charge(self.used - self.charged)?;
         self.charged = self.used;
-        let more = self.senders.len().max(n + RANKED);
+        let more = self.senders.len().max(most + ROOM);
         self.senders
             .try_reserve_exact(more)
-            .map_err(|_| no_memory_for(self.used + n))?;
+            .map_err(|_| no_memory_for(self.used + most))?;
         self.senders.resize(self.senders.len() + more, 0);
         Ok(())
     }
@@ -75,21 +74,26 @@ const TASK: usize = 4096;
 pub(super) fn assemble(
     particles: usize,
     parts: &[(&[i32], &Rows)],
+    drop_self: bool,
     threads: Threads,
     budget: &Budget,
 ) -> Result<Graph, Error> {
+    let mut counts = vec![0_u32; particles];
     let mut rows: Vec<&[i32]> = vec![&[]; particles];
     for (receivers, part) in parts {
         let mut senders = &part.senders[..];
         for (&receiver, &count) in receivers.iter().zip(&part.counts) {
-            (rows[receiver as usize], senders) = senders.split_at(count as usize);
+            // A row has room behind it, which lets whole blocks be read.
+            counts[receiver as usize] = count - u32::from(drop_self);
+            rows[receiver as usize] = senders;
+            senders = &senders[count as usize..];
         }
     }
     let mut offsets = Vec::with_capacity(particles + 1);
     let mut total = 0;
     offsets.push(0);
-    offsets.extend(rows.iter().map(|row| {
-        total += row.len() as i64;
+    offsets.extend(counts.iter().map(|&count| {
+        total += i64::from(count);
         total
     }));
 
@@ -104,29 +108,47 @@ pub(super) fn assemble(
     let mut tasks = Vec::new();
     for (t, rows) in rows.chunks(TASK).enumerate() {
         let first = t * TASK;
-        let edges = (offsets[first + rows.len()] - offsets[first]) as usize;
-        tasks.push((
-            first,
-            rows,
-            senders.split_off_mut(..edges).expect("edges left"),
-            receivers.split_off_mut(..edges).expect("edges left"),
-        ));
+        let offsets = &offsets[first..=first + rows.len()];
+        let edges = (offsets[rows.len()] - offsets[0]) as usize;
+        let senders = senders.split_off_mut(..edges).expect("edges left");
+        let receivers = receivers.split_off_mut(..edges).expect("edges left");
+        tasks.push((first, rows, offsets, senders, receivers));
     }
-    threads::map(threads, tasks, |(first, rows, senders, receivers)| {
-        let mut at = 0;
-        for (receiver, row) in (first as i64..).zip(rows) {
-            let end = at + row.len();
-            for (slot, &sender) in senders[at..end].iter_mut().zip(*row) {
-                slot.write(i64::from(sender));
+    threads::map(
+        threads,
+        tasks,
+        |(first, rows, offsets, senders, receivers)| {
+            let counts = offsets.windows(2).map(|pair| (pair[1] - pair[0]) as usize);
+            let mut at = 0;
+            for ((receiver, row), count) in (first as i32..).zip(rows).zip(counts) {
+                if drop_self {
+                    write_sorted(row, count + 1, receiver, &mut senders[at..]);
+                } else {
+                    write_sorted(row, count, -1, &mut senders[at..]);
+                }
+                fill(&mut receivers[at..], count, i64::from(receiver));
+                at += count;
             }
-            receivers[at..end].fill(MaybeUninit::new(receiver));
-            at = end;
-        }
-    });
+        },
+    );
     // SAFETY: the tasks' rows partition both halves, and each wrote all of its part.
     unsafe { edge_index.set_len(2 * edges) };
     Ok(Graph {
         edge_index,
         offsets,
     })
+}
+
+/// Writes `count` times `value` to the front of `out`: in whole blocks where there is
+/// room, since what they write too much the next row overwrites.
+#[inline(always)]
+fn fill(out: &mut [MaybeUninit<i64>], count: usize, value: i64) {
+    const BLOCK: usize = 8;
+    for start in (0..count).step_by(BLOCK) {
+        let out = &mut out[start..];
+        match out.first_chunk_mut::<BLOCK>() {
+            Some(out) => *out = [MaybeUninit::new(value); BLOCK],
+            None => out[..count - start].fill(MaybeUninit::new(value)),
+        }
+    }
 }

@@ -1,6 +1,6 @@
 //! Particles of one graph sorted into the cells of a grid.
 //!
-//! Cells are numbered along x first, so the cells `x - k ..= x + k` of a row hold one
+//! Cells are numbered along x first, so the cells `x - 1 ..= x + 1` of a row hold one
 //! contiguous run of sorted particles, and the neighbours of a cell lie in 3 such runs
 //! (9 in three dimensions). The cost of a grid follows the particles and not the volume
 //! they span: where it would have many more cells than particles, only the rows that
@@ -12,6 +12,9 @@ use super::scalar::{BLOCK, Scalar};
 
 /// Above this many cells per particle (plus a constant) a grid stores occupied rows only.
 const MOST_CELLS_PER_PARTICLE: usize = 16;
+
+/// The rows around a row, in three dimensions, twice where the x axis is periodic.
+const MOST_RUNS: usize = 2 * 9;
 
 pub(super) struct Grid<T, const D: usize> {
     axes: [Axis; D],
@@ -29,8 +32,6 @@ struct Axis {
     cells_per_length: f64,
     count: u64,
     periodic: bool,
-    /// A cutoff reaches at most this many cells to either side.
-    reach: u64,
 }
 
 /// Where the cells of each row begin among the sorted particles. A row is named by its
@@ -52,21 +53,21 @@ enum Rows<const D: usize> {
 }
 
 impl Axis {
-    /// Cuts an axis into cells no smaller than `cutoff / reach`.
+    /// Cuts an axis into cells no smaller than the cutoff.
     ///
-    /// Two particles closer than the cutoff must never lie more than `reach` cells
-    /// apart, whatever the rounding: the decision about an edge rounds a distance in
+    /// Two particles closer than the cutoff must never lie more than one cell apart,
+    /// whatever the rounding: the decision about an edge rounds a distance in
     /// `T`, relative to the cutoff on an open axis and to the period on a periodic one,
     /// and the cell rounds a coordinate in double precision, relative to the extent.
     /// Each is covered with room to spare by widening the cells as much.
-    fn new<T: Scalar>(low: f64, high: f64, period: T, cutoff: f64, reach: u64) -> Self {
+    fn new<T: Scalar>(low: f64, high: f64, period: T, cutoff: f64) -> Self {
         let periodic = period.is_finite();
         let (origin, extent, slack) = if periodic {
             (0.0, period.to_f64(), 4.0 * T::EPSILON)
         } else {
             (low, high - low, 4.0 * f64::EPSILON)
         };
-        let width = (cutoff * (1.0 + 16.0 * T::EPSILON) + extent * slack) / reach as f64;
+        let width = cutoff * (1.0 + 16.0 * T::EPSILON) + extent * slack;
         let count = if periodic {
             ((extent / width) as u64).max(1)
         } else {
@@ -82,7 +83,6 @@ impl Axis {
             cells_per_length,
             count,
             periodic,
-            reach,
         }
     }
 
@@ -94,22 +94,21 @@ impl Axis {
         cell.min(self.count - 1)
     }
 
-    /// The cells within reach of `cell`, each once, as one run and on a periodic axis
-    /// perhaps a second one.
+    /// The cell and those beside it, each once, as one run and on a periodic axis perhaps
+    /// a second one.
     #[inline(always)]
-    fn within_reach(&self, cell: u64) -> [Range<u64>; 2] {
-        let (k, n) = (self.reach, self.count);
+    fn around(&self, cell: u64) -> [Range<u64>; 2] {
+        let n = self.count;
         if !self.periodic {
-            return [cell.saturating_sub(k)..n.min(cell + k + 1), 0..0];
-        }
-        if n <= 2 * k + 1 {
+            [cell.saturating_sub(1)..n.min(cell + 2), 0..0]
+        } else if n <= 3 {
             [0..n, 0..0]
-        } else if cell < k {
-            [0..cell + k + 1, n - (k - cell)..n]
-        } else if cell + k >= n {
-            [cell - k..n, 0..cell + k + 1 - n]
+        } else if cell == 0 {
+            [0..2, n - 1..n]
+        } else if cell == n - 1 {
+            [cell - 1..n, 0..1]
         } else {
-            [cell - k..cell + k + 1, 0..0]
+            [cell - 1..cell + 2, 0..0]
         }
     }
 }
@@ -129,21 +128,14 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
     fn from_wrapped(positions: &[[T; D]], first: usize, period: &[T; D], cutoff: f64) -> Self {
         let (low, high) = bounds(positions);
         let most = MOST_CELLS_PER_PARTICLE * positions.len() + 1024;
-        // Finer cells along x tighten the runs that are searched and cost no more runs.
-        for x_reach in [2, 1] {
-            let axes: [Axis; D] = std::array::from_fn(|a| {
-                let reach = if a == 0 { x_reach } else { 1 };
-                Axis::new(low[a], high[a], period[a], cutoff, reach)
-            });
-            let cells = axes.iter().map(|axis| axis.count as f64).product::<f64>();
-            if cells <= (most / x_reach as usize) as f64 {
-                return Self::dense(positions, first, axes, cells as usize);
-            }
-            if x_reach == 1 {
-                return Self::sparse(positions, first, axes);
-            }
+        let axes: [Axis; D] =
+            std::array::from_fn(|a| Axis::new(low[a], high[a], period[a], cutoff));
+        let cells = axes.iter().map(|axis| axis.count as f64).product::<f64>();
+        if cells <= most as f64 {
+            Self::dense(positions, first, axes, cells as usize)
+        } else {
+            Self::sparse(positions, first, axes)
         }
-        unreachable!("the last reach always returns")
     }
 
     /// A stable counting sort by cell number.
@@ -262,46 +254,21 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
         ((pairs / boxes) as usize).saturating_sub(self.index().len())
     }
 
-    /// Calls `visit(receivers, candidates)` for the particles of each occupied cell
-    /// among the sorted particles `slots`, in order, until it returns false: the
-    /// candidates are the runs of sorted particles that hold every particle within the
-    /// cutoff of any receiver, each once.
-    #[inline(always)]
-    pub fn for_each_cell(
-        &self,
-        slots: Range<usize>,
-        mut visit: impl FnMut(Range<usize>, &[Range<usize>]) -> bool,
-    ) {
-        let mut slot = slots.start;
-        let (mut row, mut row_end, mut x) = (0, 0, 0);
-        let mut neighbours = Vec::new();
-        let mut candidates = Vec::new();
-        while slot < slots.end {
-            if slot >= row_end {
-                row = self.rows.row_of(slot, &self.axes);
-                x = 0;
-                row_end = self.rows.cell_start(row, self.axes[0].count, &self.axes);
-                self.neighbour_rows(row, &mut neighbours);
-            }
-            x = self.rows.x_of(row, slot, x, &self.axes);
-            let end = self.rows.cell_start(row, x + 1, &self.axes).min(slots.end);
-            candidates.clear();
-            for run in self.axes[0].within_reach(x) {
-                if !run.is_empty() {
-                    candidates.extend(neighbours.iter().map(|&row| {
-                        self.rows.cell_start(row, run.start, &self.axes)
-                            ..self.rows.cell_start(row, run.end, &self.axes)
-                    }));
-                }
-            }
-            if !visit(slot..end, &candidates) {
-                return;
-            }
-            slot = end;
+    /// Goes through the occupied cells of the sorted particles `slots`.
+    pub fn cells(&self, slots: Range<usize>) -> Cells<'_, T, D> {
+        Cells {
+            grid: self,
+            slots,
+            row: 0,
+            row_end: 0,
+            x: 0,
+            neighbours: Vec::new(),
+            runs: std::array::from_fn(|_| 0..0),
+            run_count: 0,
         }
     }
 
-    /// The rows within reach of `row`, itself included, each once.
+    /// The rows around `row`, itself included, each once.
     fn neighbour_rows(&self, row: usize, neighbours: &mut Vec<usize>) {
         neighbours.clear();
         let y_axis = &self.axes[1];
@@ -317,12 +284,12 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
             }
         };
         let z_runs = if D == 3 {
-            self.axes[2].within_reach(z)
+            self.axes[2].around(z)
         } else {
             [0..1, 0..0]
         };
         for z in z_runs.into_iter().flatten() {
-            for y in y_axis.within_reach(y).into_iter().flatten() {
+            for y in y_axis.around(y).into_iter().flatten() {
                 match &self.rows {
                     Rows::Dense { .. } => neighbours.push((z * y_axis.count + y) as usize),
                     Rows::Sparse { keys, .. } => {
@@ -336,6 +303,59 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
                 }
             }
         }
+    }
+}
+
+/// A walk through the occupied cells of some sorted particles.
+pub(super) struct Cells<'a, T, const D: usize> {
+    grid: &'a Grid<T, D>,
+    /// The particles still to come.
+    slots: Range<usize>,
+    row: usize,
+    row_end: usize,
+    x: u64,
+    /// The rows around `row`.
+    neighbours: Vec<usize>,
+    runs: [Range<usize>; MOST_RUNS],
+    run_count: usize,
+}
+
+impl<T: Scalar, const D: usize> Cells<'_, T, D> {
+    /// The runs of sorted particles that hold every particle within the cutoff of any in
+    /// the cell, each once.
+    #[inline(always)]
+    pub fn runs(&self) -> &[Range<usize>] {
+        &self.runs[..self.run_count]
+    }
+
+    /// The particles of the next cell, whose surroundings are then in [`Self::runs`].
+    #[inline(always)]
+    pub fn next(&mut self) -> Option<Range<usize>> {
+        let Grid { axes, rows, .. } = self.grid;
+        let start = self.slots.start;
+        if start >= self.slots.end {
+            return None;
+        }
+        if start >= self.row_end {
+            self.row = rows.row_of(start, axes);
+            self.row_end = rows.cell_start(self.row, axes[0].count, axes);
+            self.x = 0;
+            self.grid.neighbour_rows(self.row, &mut self.neighbours);
+        }
+        self.x = rows.x_of(self.row, start, self.x, axes);
+        self.run_count = 0;
+        for reached in axes[0].around(self.x) {
+            if !reached.is_empty() {
+                for &row in &self.neighbours {
+                    self.runs[self.run_count] = rows.cell_start(row, reached.start, axes)
+                        ..rows.cell_start(row, reached.end, axes);
+                    self.run_count += 1;
+                }
+            }
+        }
+        let end = rows.cell_start(self.row, self.x + 1, axes);
+        self.slots.start = end.min(self.slots.end);
+        Some(start..self.slots.start)
     }
 }
 

@@ -11,9 +11,8 @@ use super::edges::{self, Rows};
 use super::grid::{bounds, wrap};
 use super::input::{Batch, Options, Particles};
 use super::memory::Budget;
-use super::order::RANKED;
-use super::radius::separation;
 use super::scalar::Scalar;
+use super::search::separation;
 use crate::Error;
 use crate::threads;
 
@@ -81,7 +80,7 @@ fn build<T: Nearest, const D: usize>(
         .map(|(search, locations)| search.members_of(locations.clone()))
         .zip(&found)
         .collect();
-    edges::assemble(count, &parts, threads, &budget)
+    edges::assemble(count, &parts, false, threads, &budget)
 }
 
 /// One graph. Particles at the same place are one location, so that a pile of them
@@ -187,18 +186,18 @@ impl<T: Nearest, const D: usize> Search<T, D> {
     ) -> Result<Rows, Error> {
         let mut rows = Rows::with_receivers(self.members_of(locations.clone()).len());
         let mut nearest = Vec::new();
-        let mut row = vec![0; self.k + 1 + RANKED];
         for location in locations {
             self.nearest(location, &mut nearest);
             for &receiver in self.members_of(location..location + 1) {
                 let others = nearest.iter().map(|&(_, i)| i).filter(|&i| i != receiver);
                 let own = self_edges.then_some(receiver);
+                let row = rows.next(self.k + 1, budget)?;
                 let mut n = 0;
                 for sender in others.take(self.k).chain(own) {
                     row[n] = sender;
                     n += 1;
                 }
-                rows.push(&mut row, n, -1, budget)?;
+                rows.finish(n);
             }
         }
         Ok(rows)

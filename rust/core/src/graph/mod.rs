@@ -24,6 +24,7 @@ mod memory;
 mod order;
 mod radius;
 mod scalar;
+mod search;
 
 pub use adaptive::{Expansion, adaptive_graph};
 pub use input::{Options, Particles};

@@ -1,48 +1,56 @@
 //! Puts the senders of one receiver in ascending order.
 
-/// Longest row that is sorted by ranks; the buffers handed in have this much room
-/// past their contents.
-pub(super) const RANKED: usize = 32;
+use std::mem::MaybeUninit;
 
-/// Writes the `n` distinct senders at the front of `found` in ascending order to the
-/// front of `sorted`, without `dropped` (`-1` to drop none), which counts among the `n`
-/// if it is given. Both buffers have room for `n + RANKED`.
+/// Longest row that is sorted by ranks.
+const RANKED: usize = 64;
+
+/// Senders that are ranked together.
+const KEYS: usize = 8;
+
+/// Writes the first `n` of `row`, which are distinct, in ascending order to the front of
+/// `out`, without `dropped` if that is among them. One place behind them may be
+/// overwritten, and `row` has room for [`KEYS`] more behind its contents.
+///
+/// In a short row each sender's place is the number of smaller ones. That is quadratic,
+/// but several comparisons go to an instruction, and no branch depends on their outcome
+/// or, but for whole blocks, on `n`.
 #[inline(always)]
-pub(super) fn sort_row(found: &mut [i32], n: usize, dropped: i32, sorted: &mut [i32]) {
-    match n {
-        0..=8 => rank::<8>(found, n, dropped, sorted),
-        9..=16 => rank::<16>(found, n, dropped, sorted),
-        17..=24 => rank::<24>(found, n, dropped, sorted),
-        25..=RANKED => rank::<RANKED>(found, n, dropped, sorted),
-        _ => {
-            let found = &mut found[..n];
-            found.sort_unstable();
-            let kept = found.iter().filter(|&&sender| sender != dropped);
-            for (slot, &sender) in sorted.iter_mut().zip(kept) {
-                *slot = sender;
+pub(super) fn write_sorted(row: &[i32], n: usize, dropped: i32, out: &mut [MaybeUninit<i64>]) {
+    if n > RANKED {
+        return write_sorted_long(&row[..n], dropped, out);
+    }
+    // Whatever is not to be written comes last.
+    let mut keys = [i32::MAX; RANKED];
+    for start in (0..n).step_by(KEYS) {
+        let found: &[i32; KEYS] = row[start..].first_chunk().expect("room");
+        for l in 0..KEYS {
+            let absent = (l as i32 >= (n - start) as i32) | (found[l] == dropped);
+            keys[start + l] = if absent { i32::MAX } else { found[l] };
+        }
+    }
+    for start in (0..n).step_by(KEYS) {
+        let block: &[i32; KEYS] = keys[start..].first_chunk().expect("room");
+        let mut places = [0; KEYS];
+        for &other in &keys[..n] {
+            for l in 0..KEYS {
+                places[l] += i32::from(block[l] > other);
+            }
+        }
+        for l in 0..KEYS {
+            if let Some(slot) = out.get_mut(places[l] as usize) {
+                slot.write(i64::from(block[l]));
             }
         }
     }
 }
 
-/// Each sender's place is the number of smaller ones. Quadratic, but without a branch
-/// that could be mispredicted, and several comparisons to an instruction.
-#[inline(always)]
-fn rank<const W: usize>(found: &[i32], n: usize, dropped: i32, sorted: &mut [i32]) {
-    let found: &[i32; W] = found.first_chunk().expect("room for a block");
-    let sorted: &mut [i32; RANKED] = sorted.first_chunk_mut().expect("room for a block");
-    // What is dropped or lies past the end comes last, where nothing is counted.
-    let keys: [i32; W] = std::array::from_fn(|l| {
-        let absent = (l >= n) | (found[l] == dropped);
-        if absent { i32::MAX } else { found[l] }
-    });
-    let mut places = [0_u32; W];
-    for other in keys {
-        for (place, &key) in places.iter_mut().zip(&keys) {
-            *place += u32::from(key > other);
-        }
-    }
-    for (&place, &key) in places.iter().zip(&keys) {
-        sorted[place as usize % RANKED] = key;
+#[cold]
+fn write_sorted_long(row: &[i32], dropped: i32, out: &mut [MaybeUninit<i64>]) {
+    let mut row = row.to_vec();
+    row.sort_unstable();
+    let kept = row.iter().filter(|&&sender| sender != dropped);
+    for (slot, &sender) in out.iter_mut().zip(kept) {
+        slot.write(i64::from(sender));
     }
 }
