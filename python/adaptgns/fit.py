@@ -100,7 +100,13 @@ class Trainer:
         return Checkpoint(self.config, self.metadata, self.step, self.best_score, tensors)
 
     def save(self) -> None:
-        """Write the checkpoint that training goes on from."""
+        """Write the checkpoint that training goes on from.
+
+        Raises :class:`TrainingStopped`, and keeps the one before, where a weight is not finite:
+        the losses so far were those before the last update.
+        """
+        if not all(p.isfinite().all() for p in self.simulator.parameters()):
+            raise self._diverged("the weights became infinite or NaN")
         write_checkpoint(self.folder / LAST, self.checkpoint(resumable=True))
 
     def run(self, console: Console) -> None:
@@ -223,13 +229,17 @@ class Trainer:
             return math.nan
         mean = float(torch.stack(losses).mean())
         if not math.isfinite(mean):
-            raise TrainingStopped(
-                f"the loss became {mean} between steps {self.step - len(losses)} and {self.step}. "
-                f"{self.folder / LAST} holds the last good state. Look at: the learning rate "
-                f"(--lr, now {self.config.lr}), gradient clipping (--clip), and the data "
-                f"(python -m adaptgns.inspect {self.config.data})"
-            )
+            raise self._diverged(f"the loss became {mean} in the last {len(losses)} steps")
         return mean
+
+    def _diverged(self, what: str) -> TrainingStopped:
+        last = self.folder / LAST
+        kept = f"{last} holds the last good state. " if last.exists() else ""
+        return TrainingStopped(
+            f"{what}, by step {self.step}. {kept}Look at: the learning rate (--lr, now "
+            f"{self.config.lr}), gradient clipping (--clip), and the data "
+            f"(python -m adaptgns.inspect {self.config.data})"
+        )
 
     def _validate(self, log: Log) -> None:
         assert self.valid is not None

@@ -140,8 +140,22 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
     """Roll out the trajectories that ``config`` asks for, and write them to ``config.out``."""
     checkpoint = read_checkpoint(config.checkpoint)
     simulator = checkpoint.simulator().to(torch_device(config.device))
+    if not simulator.config.edges and config.policy != "fixed":
+        raise ValueError(
+            f"policy: got {config.policy}; this model has no edges and takes fixed alone"
+        )
+    if simulator.network.variance_head is None and config.policy not in ("fixed", "knn"):
+        raise ValueError(
+            f"policy: got {config.policy}, which needs the model's variance; this model was "
+            "trained with the loss mse, which has none; accepted are fixed and knn"
+        )
     folder = dataset_folder(config.data or checkpoint.config.data)
     split = open_split(folder, config.split)
+    if split.dim != simulator.metadata.dim:
+        raise ValueError(
+            f"data: {split.path} has {split.dim} dimensions; this model was trained on "
+            f"{simulator.metadata.dim}"
+        )
     count = len(split) if config.trajectories is None else min(config.trajectories, len(split))
     network = "GNS" if simulator.config.edges else "MLP"
     settings = {

@@ -55,7 +55,9 @@ def parse(arguments: list[str]) -> TrainConfig:
         folder = Path(resume)
         default = replace(read_checkpoint(folder / LAST).config, resume=folder, out=folder)
     elif source is not None:
-        default = from_json(TrainConfig, json.loads(Path(source).read_text()), source=source)
+        saved = from_json(TrainConfig, json.loads(Path(source).read_text()), source=source)
+        # A new run, wherever the saved one lay and whether or not it had been resumed.
+        default = replace(saved, resume=None, out=None)
     return tyro.cli(
         TrainConfig,
         default=default,
@@ -90,6 +92,7 @@ def train(config: TrainConfig, console: Console) -> Path:
     replace_text(folder / CONFIG, json.dumps(to_json(config), indent=1))
     train_split, valid_split = open_split(data, "train"), open_split(data, "valid")
     check_split(train_split, metadata)
+    open_split(data, "test")  # before the training that its rollouts end
     trainer = Trainer(
         config, metadata, folder, train=train_split, valid=valid_split, checkpoint=checkpoint
     )
@@ -138,6 +141,7 @@ def report(folder: Path, data: Path, config: TrainConfig, console: Console) -> N
                 checkpoint=folder,
                 data=str(data),
                 policy=policy,
+                device=config.device,
                 adaptive=config.adaptive,
                 steps=config.test_horizon,
                 trajectories=config.test_trajectories,

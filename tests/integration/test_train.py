@@ -8,13 +8,16 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from adaptgns.checkpoint import LAST, read_checkpoint
-from adaptgns.train import main
+from adaptgns.config import to_json
+from adaptgns.presets import PRESETS
+from adaptgns.train import main, parse
 
 
 def command(*arguments: object) -> list[str]:
@@ -100,3 +103,10 @@ def test_killed_ten_times_and_resumed_equals_uninterrupted(drops: Path, tmp_path
     assert a.step == b.step == 300
     assert a.tensors.keys() == b.tensors.keys()
     assert all(torch.equal(a.tensors[name], b.tensors[name]) for name in a.tensors)
+
+
+def test_a_saved_configuration_starts_a_run_of_its_own(tmp_path: Path) -> None:
+    saved = replace(PRESETS["smoke"], resume=tmp_path / "old", out=tmp_path / "old", lr=0.5)
+    (tmp_path / "config.json").write_text(json.dumps(to_json(saved)))
+    config = parse(["--config", str(tmp_path / "config.json"), "--seed", "7"])
+    assert config == replace(saved, resume=None, out=None, seed=7)

@@ -112,6 +112,19 @@ def test_a_loss_that_is_not_finite_stops_with_what_to_look_at(
     assert all(t.isfinite().all() for t in kept.tensors.values())
 
 
+def test_weights_that_are_not_finite_are_not_saved(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    run = trainer(drops, tmp_path, small_config)
+    run.save()
+    kept = (tmp_path / LAST).read_bytes()
+    with torch.no_grad():
+        next(run.simulator.parameters()).fill_(torch.nan)
+    with pytest.raises(TrainingStopped, match=r"weights became.*last good state"):
+        run.save()
+    assert (tmp_path / LAST).read_bytes() == kept
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_save_and_say_how_to_go_on(
     drops: Path,

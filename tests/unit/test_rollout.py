@@ -8,12 +8,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
-from adaptgns.config import AdaptiveConfig, ModelConfig, PolicyName
-from adaptgns.data.metadata import Metadata
+from adaptgns.checkpoint import (
+    BEST,
+    Checkpoint,
+    build_simulator,
+    with_prefix,
+    write_checkpoint,
+)
+from adaptgns.config import (
+    AdaptiveConfig,
+    Loss,
+    ModelConfig,
+    PolicyName,
+    RolloutConfig,
+    TrainConfig,
+)
+from adaptgns.data.metadata import Metadata, read_metadata
 from adaptgns.data.trajectories import Trajectory, open_split
 from adaptgns.policies import Adaptive, Fixed, make_policy
-from adaptgns.rollout import steps
+from adaptgns.rollout import steps, write_rollouts
 from adaptgns.simulator import Simulator
 
 RULE = AdaptiveConfig(tau=70, factor=1.5)
@@ -121,3 +136,27 @@ def test_variance_is_needed_by_two_pass(metadata: Metadata, trajectory: Trajecto
 def test_too_long_a_horizon_is_named(simulator: Simulator, trajectory: Trajectory) -> None:
     with pytest.raises(ValueError, match=r"count: .* has 40 frames, so 1 to 34 steps.*got 35"):
         list(steps(simulator, trajectory, Fixed(), 35))
+
+
+@pytest.mark.parametrize(
+    ("edges", "loss", "policy", "message"),
+    [
+        (True, "mse", "adaptive", "policy: got adaptive, which needs the model's variance"),
+        (True, "mse", "random", "policy: got random, which needs the model's variance"),
+        (False, "nll", "knn", "policy: got knn; this model has no edges"),
+    ],
+)
+def test_a_policy_that_the_model_cannot_follow_is_refused(
+    drops: Path, tmp_path: Path, edges: bool, loss: Loss, policy: PolicyName, message: str
+) -> None:
+    model = ModelConfig(latent=8, hidden_layers=1, steps=1, edges=edges)
+    config = TrainConfig(data=str(drops), model=model, loss=loss)
+    metadata = read_metadata(drops)
+    weights = with_prefix("model", build_simulator(config, metadata).state_dict())
+    write_checkpoint(tmp_path / BEST, Checkpoint(config, metadata, 0, 0.0, weights))
+    out = tmp_path / "rollout.h5"
+    with pytest.raises(ValueError, match=message):
+        write_rollouts(
+            RolloutConfig(checkpoint=tmp_path, out=out, policy=policy), Console(quiet=True)
+        )
+    assert not out.exists()
