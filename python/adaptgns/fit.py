@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 import numpy as np
 import torch
@@ -38,6 +33,7 @@ from adaptgns.checkpoint import (
 from adaptgns.config import TrainConfig, torch_device
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
+from adaptgns.interruption import interruption
 from adaptgns.losses import training_loss
 from adaptgns.policies import Edges, State
 from adaptgns.rollout import to_sigma
@@ -285,25 +281,3 @@ class Log:
     def __exit__(self, *_: object) -> None:
         self.file.close()
         self.board.close()
-
-
-@contextmanager
-def interruption() -> Iterator[list[str]]:
-    """A list that stays empty until SIGINT or SIGTERM arrives, which then names the signal.
-
-    A second signal acts as it would have without this.
-    """
-    received: list[str] = []
-    previous: dict[int, Any] = {}
-
-    def note(number: int, _: FrameType | None) -> None:
-        received.append(signal.Signals(number).name)
-        signal.signal(number, previous[number])
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        previous[number] = signal.signal(number, note)
-    try:
-        yield received
-    finally:
-        for caught, handler in previous.items():
-            signal.signal(caught, handler)

@@ -7,6 +7,7 @@ depends neither on the number of loading workers nor on where it was interrupted
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count, islice
@@ -210,4 +211,10 @@ def training_batches(
         num_workers=config.workers,
         collate_fn=windows.collate,
         pin_memory=pin,
+        worker_init_fn=_leave_interrupts_to_the_parent,
     )
+
+
+def _leave_interrupts_to_the_parent(_: int) -> None:
+    """Ctrl-C reaches every process of the terminal; the parent saves, and ends its workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

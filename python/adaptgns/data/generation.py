@@ -29,6 +29,7 @@ from adaptgns.data.statistics import MotionAccumulator, MotionStatistics, comput
 from adaptgns.data.store import StoreWriter, partial_path, read_origin
 from adaptgns.data.trajectories import Trajectories, open_split
 from adaptgns.data.trajectory import MIN_FRAMES, Trajectory
+from adaptgns.interruption import interruption
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -154,11 +155,13 @@ def _simulate(split: str, plan: SplitPlan, index: int) -> Trajectory:
 def _write_split(path: Path, split: str, plan: SplitPlan, progress: Progress) -> MotionStatistics:
     motion = MotionAccumulator(plan.dim, box=None, kinematic_types=GNS_KINEMATIC)
     task = progress.add_task(split, total=plan.trajectories)
-    with StoreWriter(path, origin=_origin(split, plan)) as writer:
+    with interruption() as interrupted, StoreWriter(path, origin=_origin(split, plan)) as writer:
         for trajectory in simulate_split(split, plan):
             writer.append(trajectory)
             motion.add(trajectory.positions, trajectory.particle_type)
             progress.advance(task)
+            if interrupted:
+                raise KeyboardInterrupt
     return motion.finish()
 
 

@@ -1,0 +1,38 @@
+"""Signals that ask a long job to end."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+
+@contextmanager
+def interruption() -> Iterator[list[str]]:
+    """A list that stays empty until SIGINT or SIGTERM arrives, which then names the signal.
+
+    The work looks at it where it can stop: an exception out of a signal handler can surface
+    anywhere, and is lost where it does so in a destructor or a callback of a C library. A second
+    signal acts as it would have without this. Threads other than the main one get no signals, and
+    here an empty list.
+    """
+    received: list[str] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+    previous: dict[int, Any] = {}
+
+    def note(number: int, _: FrameType | None) -> None:
+        received.append(signal.Signals(number).name)
+        signal.signal(number, previous[number])
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        previous[number] = signal.signal(number, note)
+    try:
+        yield received
+    finally:
+        for caught, handler in previous.items():
+            signal.signal(caught, handler)
