@@ -20,7 +20,8 @@ from PIL import Image
 
 from adaptgns._core import adaptive_graph, radius_graph
 from adaptgns.atomic import written_whole
-from adaptgns.metrics import Floats, edge_counts, minimum_image, position_mse
+from adaptgns.metrics import Floats, edge_counts, position_mse
+from adaptgns.periodic import minimum_image
 from adaptgns.rollout_file import Rollout, RolloutFile
 from adaptgns.view import View
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptgns.metrics import Floats, minimum_image
+from adaptgns.metrics import Floats
+from adaptgns.periodic import minimum_image
 
 GRAVITY = 9.81
 """Length units per second²"""

@@ -7,9 +7,7 @@ import math
 import time
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -33,9 +31,9 @@ from adaptgns.checkpoint import (
 from adaptgns.config import TrainConfig, torch_device
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
+from adaptgns.graph import adaptive_graph
 from adaptgns.interruption import interruption
 from adaptgns.losses import training_loss
-from adaptgns.policies import Edges, State
 from adaptgns.rollout import to_sigma
 from adaptgns.segment import Graph
 from adaptgns.validation import validate
@@ -62,6 +60,11 @@ class Trainer:
         valid: Trajectories | None,
         checkpoint: Checkpoint | None = None,
     ) -> None:
+        if config.graph == "adaptive" and (config.loss == "mse" or not config.model.edges):
+            raise ValueError(
+                "graph: adaptive needs a model with edges and a variance; got the loss "
+                f"{config.loss} and model.edges {config.model.edges}"
+            )
         self.config, self.metadata, self.folder, self.valid = config, metadata, folder, valid
         self.device = torch_device(config.device)
         torch.manual_seed(config.seed)
@@ -194,30 +197,23 @@ class Trainer:
     def _lagged_graph(self, batch: Batch) -> Graph:
         """The adaptive graph that a rollout would have here: its sigma comes from a pass without
         gradient over the window one frame earlier, on that window's base graph."""
-        rule, mobile = self.config.adaptive, batch.mobile.cpu().numpy()
-
-        def state(window: Tensor, sigma: NDArray[np.float32] | None) -> State:
-            return State(
-                positions=window[:, -1].cpu().numpy(),
-                sigma=sigma,
-                mobile=mobile,
-                radius=self.simulator.radius,
-                self_edges=self.config.model.self_edges,
-                box=self.metadata.box,
-                ptr=batch.ptr.cpu().numpy(),
-                predict_sigma=predict_sigma,
+        with torch.no_grad():
+            earlier = self.simulator(
+                batch.earlier_window, batch.particle_type, batch.graph, batch.material
             )
-
-        def predict_sigma(edges: Edges) -> NDArray[np.float32]:
-            graph = Graph.from_numpy(*edges).to(self.device)
-            with torch.no_grad():
-                prediction = self.simulator(
-                    batch.earlier_window, batch.particle_type, graph, batch.material
-                )
-            return to_sigma(prediction)
-
-        sigma = predict_sigma(state(batch.earlier_window, None).base())
-        return Graph.from_numpy(*state(batch.window, sigma).expanded(sigma, rule)).to(self.device)
+        edges = adaptive_graph(
+            batch.window[:, -1].cpu().numpy(),
+            to_sigma(earlier),
+            self.simulator.radius,
+            self.config.adaptive.tau,
+            self.config.adaptive.factor,
+            ptr=batch.ptr.cpu().numpy(),
+            box=self.metadata.box,
+            self_edges=self.config.model.self_edges,
+            eligible=batch.mobile.cpu().numpy(),
+            return_offsets=True,
+        )
+        return Graph.from_numpy(*edges).to(self.device)
 
     def _mean_loss(self, losses: list[Tensor]) -> float:
         """Mean of ``losses``; raises :class:`TrainingStopped` unless it is finite."""

@@ -15,20 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptgns._core import radius_graph
+from adaptgns.periodic import minimum_image
 
 Floats = NDArray[np.float32] | NDArray[np.float64]
-
-
-def minimum_image(difference: Floats, box: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """``difference`` ``[..., d]`` of positions, to the nearest image.
-
-    ``box`` ``[d]`` holds the period lengths, inf (or 0) along open axes; None: all axes are open.
-    """
-    nearest = np.array(difference, dtype=np.float64)
-    if box is not None:
-        for axis in np.flatnonzero(np.isfinite(box) & (box > 0)):
-            nearest[..., axis] -= box[axis] * np.round(nearest[..., axis] / box[axis])
-    return nearest
 
 
 def position_mse(

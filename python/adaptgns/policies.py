@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptgns._core import adaptive_graph, knn_graph, radius_graph
 from adaptgns.config import AdaptiveConfig, PolicyName
+from adaptgns.graph import adaptive_graph, knn_graph, radius_graph
 
 Edges = tuple[NDArray[np.int64], NDArray[np.int64]]
 """``[2, E]`` senders and receivers, and the receivers' row offsets ``[N + 1]``"""
@@ -37,15 +37,12 @@ class State:
     """``[d]`` period lengths, inf along open axes"""
     predict_sigma: Callable[[Edges], NDArray[np.float32]]
     """A forward pass of the model on given edges, for its sigma ``[N]`` alone"""
-    ptr: NDArray[np.int64] | None = None
-    """``[B + 1]`` offsets of independent systems"""
 
     def base(self) -> Edges:
         """The radius graph."""
         return radius_graph(
             self.positions,
             self.radius,
-            ptr=self.ptr,
             box=self.box,
             self_edges=self.self_edges,
             return_offsets=True,
@@ -59,7 +56,6 @@ class State:
             self.radius,
             rule.tau,
             rule.factor,
-            ptr=self.ptr,
             box=self.box,
             self_edges=self.self_edges,
             eligible=self.mobile,
@@ -70,6 +66,10 @@ class State:
 class Policy(Protocol):
     """Chooses the graph of every step."""
 
+    name: ClassVar[PolicyName]
+    needs_sigma: ClassVar[bool]
+    """Whether it takes a model with a variance head"""
+
     def edges(self, state: State) -> Edges:
         """The edges of the step that starts in ``state``."""
 
@@ -77,6 +77,9 @@ class Policy(Protocol):
 @dataclass(frozen=True)
 class Fixed:
     """All pairs within the base radius."""
+
+    name: ClassVar[PolicyName] = "fixed"
+    needs_sigma: ClassVar[bool] = False
 
     def edges(self, state: State) -> Edges:
         return state.base()
@@ -86,6 +89,8 @@ class Fixed:
 class Adaptive:
     """The particles most uncertain one step ago see farther; the first step has the base graph."""
 
+    name: ClassVar[PolicyName] = "adaptive"
+    needs_sigma: ClassVar[bool] = True
     rule: AdaptiveConfig
 
     def edges(self, state: State) -> Edges:
@@ -97,6 +102,8 @@ class TwoPass:
     """The particles most uncertain now see farther, at the price of a second forward pass: what
     the lag of :class:`Adaptive` costs in accuracy."""
 
+    name: ClassVar[PolicyName] = "two-pass"
+    needs_sigma: ClassVar[bool] = True
     rule: AdaptiveConfig
 
     def edges(self, state: State) -> Edges:
@@ -107,6 +114,8 @@ class TwoPass:
 class Random:
     """As many particles as in :class:`Adaptive` see farther, drawn at every step: the control."""
 
+    name: ClassVar[PolicyName] = "random"
+    needs_sigma: ClassVar[bool] = True
     rule: AdaptiveConfig
     rng: np.random.Generator
 
@@ -120,13 +129,14 @@ class Random:
 class NearestNeighbours:
     """The k nearest particles of each, at any distance."""
 
+    name: ClassVar[PolicyName] = "knn"
+    needs_sigma: ClassVar[bool] = False
     k: int
 
     def edges(self, state: State) -> Edges:
         return knn_graph(
             state.positions,
             self.k,
-            ptr=state.ptr,
             box=state.box,
             self_edges=state.self_edges,
             return_offsets=True,

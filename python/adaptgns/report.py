@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-from adaptgns.atomic import written_whole
+from adaptgns.atomic import replace_text
 from adaptgns.graph_statistics import GraphStatistics
 from adaptgns.metrics import Calibration
 
@@ -96,8 +96,7 @@ class Report:
     def write(self, path: Path) -> None:
         """Write :meth:`to_json` to ``path``, whole or not at all."""
         content = json.dumps(self.to_json(), indent=1, allow_nan=False)
-        with written_whole(path) as partial:
-            partial.write_text(content + "\n", encoding="utf-8")
+        replace_text(path, content + "\n")
 
     def print(self, console: Console) -> None:
         """Print the tables. One too wide for ``console`` is cut into several below each other,

@@ -57,7 +57,24 @@ def steps(
 
     ``radius`` changes the graph only: features stay divided by the radius the model was trained
     with. With ``teacher_forcing`` every step starts from the true positions.
+
+    Raises ValueError for a trajectory or a policy that does not go with the model.
     """
+    if policy.needs_sigma and simulator.network.variance_head is None:
+        raise ValueError(
+            f"policy: got {policy.name}, which needs the model's variance; this model was trained "
+            "with the loss mse, which has none; accepted are fixed and knn"
+        )
+    if policy.name != "fixed" and not simulator.config.edges:
+        raise ValueError(
+            f"policy: got {policy.name}; this model has no edges and takes fixed alone"
+        )
+    dim = trajectory.positions.shape[2]
+    if dim != simulator.metadata.dim:
+        raise ValueError(
+            f"data: trajectory {trajectory.name} has {dim} dimensions; this model was trained on "
+            f"{simulator.metadata.dim}"
+        )
     frames = len(trajectory.positions)
     if not 0 < count <= frames - HISTORY:
         raise ValueError(
@@ -106,7 +123,7 @@ def steps(
         finished = time.perf_counter()
         error = prediction.acceleration - simulator.target(window, true[index])
         if prediction.variance is not None:
-            sigma = prediction.variance.sqrt().cpu().numpy()
+            sigma = to_sigma(prediction)
         yield Step(
             positions=positions,
             sigma=sigma,
@@ -120,12 +137,8 @@ def steps(
 
 
 def to_sigma(prediction: Prediction) -> NDArray[np.float32]:
-    """``[N]`` standard deviations in normalized units."""
-    if prediction.variance is None:
-        raise ValueError(
-            "policy: it needs the model's variance, and this model was trained with the loss mse, "
-            "which has none; accepted policies are fixed and knn"
-        )
+    """``[N]`` standard deviations in normalized units, of a model with a variance head."""
+    assert prediction.variance is not None
     sigma: NDArray[np.float32] = prediction.variance.sqrt().cpu().numpy()
     return sigma
 
@@ -140,22 +153,8 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
     """Roll out the trajectories that ``config`` asks for, and write them to ``config.out``."""
     checkpoint = read_checkpoint(config.checkpoint)
     simulator = checkpoint.simulator().to(torch_device(config.device))
-    if not simulator.config.edges and config.policy != "fixed":
-        raise ValueError(
-            f"policy: got {config.policy}; this model has no edges and takes fixed alone"
-        )
-    if simulator.network.variance_head is None and config.policy not in ("fixed", "knn"):
-        raise ValueError(
-            f"policy: got {config.policy}, which needs the model's variance; this model was "
-            "trained with the loss mse, which has none; accepted are fixed and knn"
-        )
     folder = dataset_folder(config.data or checkpoint.config.data)
     split = open_split(folder, config.split)
-    if split.dim != simulator.metadata.dim:
-        raise ValueError(
-            f"data: {split.path} has {split.dim} dimensions; this model was trained on "
-            f"{simulator.metadata.dim}"
-        )
     count = len(split) if config.trajectories is None else min(config.trajectories, len(split))
     network = "GNS" if simulator.config.edges else "MLP"
     settings = {

@@ -88,14 +88,13 @@ def train(config: TrainConfig, console: Console) -> Path:
         torch.set_num_threads(config.threads)
     data = dataset_folder(config.data)
     metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
-    folder.mkdir(parents=True, exist_ok=True)
-    replace_text(folder / CONFIG, json.dumps(to_json(config), indent=1))
     train_split, valid_split = open_split(data, "train"), open_split(data, "valid")
     check_split(train_split, metadata)
     open_split(data, "test")  # before the training that its rollouts end
     trainer = Trainer(
         config, metadata, folder, train=train_split, valid=valid_split, checkpoint=checkpoint
     )
+    replace_text(folder / CONFIG, json.dumps(to_json(config), indent=1))
     console.print(
         f"training on {data}: {len(trainer.windows):,} windows, "
         f"{sum(p.numel() for p in trainer.simulator.parameters()):,} parameters, "

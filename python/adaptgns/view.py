@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptgns.data.metadata import Metadata
-from adaptgns.metrics import Floats, minimum_image
+from adaptgns.metrics import Floats
+from adaptgns.periodic import minimum_image
 
 AZIMUTH, ELEVATION = np.radians(-60.0), np.radians(22.0)
 """Of the camera, around the last axis and above the plane of the others"""

@@ -55,7 +55,8 @@ class Batch:
     ptr: Tensor
     """int64 ``[B + 1]``, offsets of the samples"""
     graph: Graph | None
-    """The base graph of the last input positions; None for a model without edges"""
+    """The base graph of the last input positions, or of those one frame before where training
+    sees adaptive graphs and needs a variance from there; None for a model without edges"""
 
     @property
     def window(self) -> Tensor:
@@ -133,7 +134,7 @@ class Windows(Dataset[Sample]):
         graph = None
         if model.edges:
             edges = radius_graph(
-                frames[-2],
+                frames[-3] if self.config.graph == "adaptive" else frames[-2],
                 model.radius if model.radius is not None else self.metadata.radius,
                 ptr=ptr,
                 box=self.metadata.box,

@@ -112,6 +112,15 @@ def test_a_loss_that_is_not_finite_stops_with_what_to_look_at(
     assert all(t.isfinite().all() for t in kept.tensors.values())
 
 
+def test_adaptive_training_needs_edges_and_a_variance(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    no_edges = replace(small_config, model=replace(small_config.model, edges=False))
+    for config in (replace(small_config, loss="mse"), no_edges):
+        with pytest.raises(ValueError, match="graph: adaptive needs a model with edges"):
+            trainer(drops, tmp_path, replace(config, graph="adaptive"))
+
+
 def test_weights_that_are_not_finite_are_not_saved(
     drops: Path, tmp_path: Path, small_config: TrainConfig
 ) -> None:

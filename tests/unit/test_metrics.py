@@ -14,11 +14,11 @@ from adaptgns.metrics import (
     edge_counts,
     kinetic_energy,
     kinetic_energy_error,
-    minimum_image,
     one_step_mse,
     position_mse,
     spearman,
 )
+from adaptgns.periodic import minimum_image
 
 ALL = np.ones(4, dtype=bool)
 

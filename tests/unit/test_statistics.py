@@ -9,8 +9,9 @@ import pytest
 
 from adaptgns.data import DataError, Trajectory, open_split
 from adaptgns.data import statistics as statistics_module
-from adaptgns.data.statistics import compute_statistics, minimum_image
+from adaptgns.data.statistics import compute_statistics
 from adaptgns.data.store import write_split
+from adaptgns.periodic import minimum_image
 
 
 def walks(seed: int, box: float | None = None) -> list[Trajectory]:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from adaptgns._core import radius_graph
-from adaptgns.data.statistics import minimum_image
+from adaptgns.periodic import minimum_image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from adaptgns.data.errors import DataError
+from adaptgns.periodic import minimum_image
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -75,17 +76,6 @@ class _Moments:
     @property
     def std(self) -> npt.NDArray[np.float64]:
         return np.sqrt(self.deviation / self.count)
-
-
-def minimum_image(
-    displacement: npt.NDArray[np.float64], box: npt.NDArray[np.float64] | None
-) -> npt.NDArray[np.float64]:
-    """The displacement to the nearest image; `box` as in `Metadata.box`."""
-    if box is None:
-        return displacement
-    periods = np.where(np.isfinite(box), box, 0.0)
-    inverse = np.where(np.isfinite(box), 1.0 / box, 0.0)
-    return displacement - periods * np.round(displacement * inverse)
 
 
 class MotionAccumulator:
