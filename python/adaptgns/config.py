@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -9,6 +11,7 @@ from typing import Any, Literal, TypeVar
 import cattrs
 import torch
 from cattrs.preconf.json import make_converter
+from cattrs.v import format_exception
 
 from adaptgns.data.trajectory import INPUT_FRAMES
 
@@ -21,6 +24,25 @@ Loss = Literal["nll", "beta-nll", "mse"]
 Preset = Literal["smoke", "laptop", "paper"]
 PolicyName = Literal["fixed", "adaptive", "two-pass", "random", "knn"]
 Device = Literal["auto", "cpu", "cuda"]
+
+Range = tuple[str, Callable[[float], bool]]
+"""What is accepted, in words and as a test; NaN fails them all."""
+
+COUNT: Range = ("whole numbers >= 1", lambda value: value >= 1)
+NOT_NEGATIVE: Range = ("finite numbers >= 0", lambda value: 0 <= value < math.inf)
+POSITIVE: Range = ("finite numbers > 0", lambda value: 0 < value < math.inf)
+SHARE: Range = ("numbers from 0 to 1", lambda value: 0 <= value <= 1)
+PERCENTILE: Range = ("numbers from 0 to 100", lambda value: 0 <= value <= 100)
+FACTOR: Range = ("finite numbers >= 1", lambda value: 1 <= value < math.inf)
+
+
+def _require(config: object, **ranges: Range) -> None:
+    """Raise ValueError for the first field of ``config`` that is outside its range; None, where a
+    field may be that, is inside."""
+    for name, (accepted, holds) in ranges.items():
+        value = getattr(config, name)
+        if value is not None and not holds(value):
+            raise ValueError(f"{name}: got {value}; accepted are {accepted}")
 
 
 @dataclass(frozen=True)
@@ -42,6 +64,9 @@ class ModelConfig:
     walls: bool = False
     """Hold particles inside the bounds of open axes, as solid walls do."""
 
+    def __post_init__(self) -> None:
+        _require(self, latent=COUNT, hidden_layers=COUNT, steps=COUNT, radius=POSITIVE)
+
 
 @dataclass(frozen=True)
 class AdaptiveConfig:
@@ -51,6 +76,9 @@ class AdaptiveConfig:
     """Percentile of sigma above which a particle sees farther."""
     factor: float = 1.267
     """How many times farther."""
+
+    def __post_init__(self) -> None:
+        _require(self, tau=PERCENTILE, factor=FACTOR)
 
 
 @dataclass(frozen=True)
@@ -84,6 +112,17 @@ class RolloutConfig:
     """Seed of the policy random."""
     device: Device = "auto"
     """auto: a GPU where there is one."""
+
+    def __post_init__(self) -> None:
+        _require(
+            self,
+            k=COUNT,
+            radius=POSITIVE,
+            steps=COUNT,
+            trajectories=COUNT,
+            one_step_every=COUNT,
+            seed=NOT_NEGATIVE,
+        )
 
 
 @dataclass(frozen=True)
@@ -148,6 +187,29 @@ class TrainConfig:
     test_horizon: int | None = 200
     """Frames of those rollouts; None: to the end."""
 
+    def __post_init__(self) -> None:
+        _require(
+            self,
+            steps=COUNT,
+            batch=COUNT,
+            batch_particles=COUNT,
+            lr=POSITIVE,
+            lr_final=NOT_NEGATIVE,
+            warmup=NOT_NEGATIVE,
+            clip=POSITIVE,
+            noise=NOT_NEGATIVE,
+            position_correction=SHARE,
+            seed=NOT_NEGATIVE,
+            workers=NOT_NEGATIVE,
+            threads=COUNT,
+            validate_every=COUNT,
+            validate_trajectories=COUNT,
+            validate_horizon=COUNT,
+            checkpoint_every=COUNT,
+            test_trajectories=COUNT,
+            test_horizon=COUNT,
+        )
+
 
 T = TypeVar("T")
 
@@ -184,5 +246,12 @@ def from_json(kind: type[T], values: dict[str, Any], *, source: str) -> T:
     try:
         return _converter.structure(values, kind)
     except cattrs.BaseValidationError as error:
-        problems = "; ".join(cattrs.transform_error(error))
+        problems = "; ".join(cattrs.transform_error(error, format_exception=_describe))
         raise ConfigError(f"configuration {source}: {problems}") from error
+
+
+def _describe(error: BaseException, kind: type | None) -> str:
+    """A problem in a configuration, in words; those that ``_require`` found have their own."""
+    if type(error) is ValueError and str(error):
+        return str(error)
+    return format_exception(error, kind)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from adaptgns.baselines import GRAVITY, constant_gravity, constant_velocity
+from adaptgns.command import plain_errors
 from adaptgns.data.metadata import Metadata
 from adaptgns.graph_statistics import GraphStatistics, graph_statistics
 from adaptgns.metrics import (
@@ -358,11 +359,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     config = tyro.cli(EvaluateConfig, args=argv, prog="python -m adaptgns.evaluate")
     console = Console()
     out = config.rollouts[0].parent if config.out is None and config.rollouts else config.out
-    try:
+    with plain_errors():
         evaluate(config.rollouts, config.steps, out=out, console=console)
-    except (ValueError, OSError) as error:
-        console.print(f"error: {error}", markup=False, style="red", soft_wrap=True)
-        raise SystemExit(2) from None
     assert out is not None  # without a file evaluate raises
     console.print(str(out / METRICS), highlight=False, soft_wrap=True)
 

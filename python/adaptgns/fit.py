@@ -81,6 +81,13 @@ class Trainer:
             )
 
     def _restore(self, checkpoint: Checkpoint) -> None:
+        for name in ("model", "loss", "noise"):
+            saved, given = getattr(checkpoint.config, name), getattr(self.config, name)
+            if given != saved:
+                raise ValueError(
+                    f"{name}: the run was started with {saved}; got {given}; what a checkpoint's "
+                    "weights are made for stays as it is, or is trained anew in another folder"
+                )
         self.simulator.load_state_dict(checkpoint.group("model"))
         state: dict[int, dict[str, Tensor]] = {}
         for name, tensor in checkpoint.group("optimizer").items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -13,6 +12,7 @@ from rich import box as boxes
 from rich.console import Console
 from rich.table import Table
 
+from adaptgns.command import plain_errors
 from adaptgns.data.check import Problem, find_problems
 from adaptgns.data.default import dataset_folder
 from adaptgns.data.errors import DataError
@@ -95,13 +95,8 @@ def inspect(config: InspectConfig, console: Console) -> list[Problem]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command with `argv`, or with the process's own arguments."""
     config = tyro.cli(InspectConfig, args=argv, prog="python -m adaptgns.inspect")
-    try:
+    with plain_errors():
         problems = inspect(config, Console(highlight=False))
-    except KeyboardInterrupt:
-        raise SystemExit(130) from None
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
     if any(problem.fatal for problem in problems):
         raise SystemExit(1)
 

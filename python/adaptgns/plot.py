@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 
 from adaptgns.animation import Animation
+from adaptgns.command import plain_errors
 from adaptgns.rollout_file import RolloutFile
 
 
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         {"animate": AnimateConfig}, args=argv, prog="python -m adaptgns.plot"
     )
     console = Console()
-    try:
+    with plain_errors(IndexError):
         animate(
             config.rollout,
             config.out,
@@ -65,9 +66,6 @@ def main(argv: Sequence[str] | None = None) -> None:
             every=config.every,
             fps=config.fps,
         )
-    except (ValueError, IndexError, OSError) as error:
-        console.print(f"error: {error}", markup=False, style="red", soft_wrap=True)
-        raise SystemExit(2) from None
     console.print(str(config.out), highlight=False, soft_wrap=True)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from adaptgns.checkpoint import read_checkpoint
+from adaptgns.command import plain_errors
 from adaptgns.config import HISTORY, RolloutConfig, to_json, torch_device
 from adaptgns.data.default import dataset_folder
 from adaptgns.data.trajectories import Trajectory, open_split
@@ -196,11 +196,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         config=(tyro.conf.OmitArgPrefixes,),
     )
     console = Console()
-    try:
+    with plain_errors(torch.OutOfMemoryError):
         write_rollouts(config, console)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
     console.print(f"{config.out}", highlight=False)
 
 

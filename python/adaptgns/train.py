@@ -14,6 +14,7 @@ from rich.console import Console
 
 from adaptgns.atomic import replace_text
 from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint
+from adaptgns.command import plain_errors
 from adaptgns.config import PolicyName, RolloutConfig, TrainConfig, from_json, to_json
 from adaptgns.data.check import check_split
 from adaptgns.data.default import dataset_folder
@@ -31,15 +32,13 @@ CONFIG = "config.json"
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
     console = Console()
-    try:
+    with plain_errors(torch.OutOfMemoryError):
         config = parse(sys.argv[1:] if argv is None else list(argv))
-        train(config, console)
-    except TrainingStopped as stopped:
-        console.print(str(stopped), markup=False)
-        raise SystemExit(1) from None
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+        try:
+            train(config, console)
+        except TrainingStopped as stopped:
+            console.print(str(stopped), markup=False)
+            raise SystemExit(1) from None
 
 
 def parse(arguments: list[str]) -> TrainConfig:
@@ -88,9 +87,11 @@ def train(config: TrainConfig, console: Console) -> Path:
         torch.set_num_threads(config.threads)
     data = dataset_folder(config.data)
     metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
-    train_split, valid_split = open_split(data, "train"), open_split(data, "valid")
-    check_split(train_split, metadata)
-    open_split(data, "test")  # before the training that its rollouts end
+    train_split, valid_split, test_split = (
+        open_split(data, split) for split in ("train", "valid", "test")
+    )
+    for split in (train_split, valid_split, test_split):  # before anything depends on them
+        check_split(split, metadata)
     trainer = Trainer(
         config, metadata, folder, train=train_split, valid=valid_split, checkpoint=checkpoint
     )
@@ -102,7 +103,13 @@ def train(config: TrainConfig, console: Console) -> Path:
         highlight=False,
     )
     trainer.run(console)
-    report(folder, data, config, console)
+    try:
+        report(folder, data, config, console)
+    except KeyboardInterrupt:
+        raise TrainingStopped(
+            f"stopped in the rollouts; the training is saved. Repeat them with\n"
+            f"  python -m adaptgns.train --resume {folder}"
+        ) from None
     return folder
 
 

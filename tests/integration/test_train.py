@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 import torch
 
@@ -68,6 +71,36 @@ def test_wrong_arguments_are_named(
         main(arguments)
     assert exit_.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_run_is_resumed_with_what_its_weights_are_made_for(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["--preset", "smoke", "--data", str(drops), "--out", str(tmp_path), "--steps", "2"])
+    saved = (tmp_path / "config.json").read_bytes()
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+        main(["--resume", str(tmp_path), "--loss", "mse"])
+    assert exit_.value.code == 2
+    assert "loss: the run was started with nll; got mse" in capsys.readouterr().err
+    assert (tmp_path / "config.json").read_bytes() == saved
+
+
+def test_damaged_test_data_is_told_before_training(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(drops, data)
+    with h5py.File(data / "test.h5", "r+") as file:
+        name = min(file)
+        file[name]["position"][20, 3] = np.nan
+    with pytest.raises(SystemExit) as exit_:
+        main(["--preset", "smoke", "--data", str(data), "--out", str(tmp_path / "run")])
+    assert exit_.value.code == 2
+    told = capsys.readouterr().err
+    assert "test.h5" in told
+    assert "frame 20" in told
+    assert not (tmp_path / "run").exists()
 
 
 def test_killed_ten_times_and_resumed_equals_uninterrupted(drops: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -89,3 +90,14 @@ def test_unknown_keys_and_wrong_kinds_are_refused(small_config: TrainConfig) -> 
         from_json(TrainConfig, values | {"model": {"latents": 3}}, source="x")
     with pytest.raises(ConfigError, match="loss"):
         from_json(TrainConfig, values | {"loss": "mae"}, source="x")
+    with pytest.raises(ConfigError, match="batch: got 0; accepted are whole numbers >= 1"):
+        from_json(TrainConfig, values | {"batch": 0}, source="x")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("steps", 0), ("lr", math.nan), ("noise", math.inf), ("position_correction", 1.5)],
+)
+def test_values_outside_their_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name}: got {value}; accepted are"):
+        replace(TrainConfig(), **{name: value})
