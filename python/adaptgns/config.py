@@ -61,6 +61,10 @@ class ModelConfig:
     """Connect every particle with itself, too."""
     radius: float | None = None
     """Connectivity radius (length units of the data); None: the data set's own."""
+    relative_motion: bool = False
+    """Features that tell small differences of velocity apart: of the particles, the last velocity
+    and the accelerations before it instead of all five velocities; of the edges, also the relative
+    velocity of their ends and its part along the edge."""
     walls: bool = False
     """Hold particles inside the bounds of open axes, as solid walls do."""
 

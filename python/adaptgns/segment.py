@@ -7,6 +7,7 @@ fastest such kernel on CPU and is there on CUDA, too.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,19 +24,27 @@ class Graph:
 
     ``senders`` and ``receivers`` are int64 ``[E]``; the edges into particle i are the rows
     ``receiver_offsets[i]:receiver_offsets[i + 1]``. ``by_sender`` ``[E]`` lists the edges sorted
-    by sender, and ``sender_offsets`` ``[N + 1]`` delimits each sender's part of that list.
+    by sender, and ``sender_offsets`` ``[N + 1]`` delimits each sender's part of that list; only
+    the backward pass needs the two, and a graph for inference has None.
     """
 
     senders: Tensor
     receivers: Tensor
     receiver_offsets: Tensor
-    by_sender: Tensor
-    sender_offsets: Tensor
+    by_sender: Tensor | None = None
+    sender_offsets: Tensor | None = None
 
     @staticmethod
     def from_numpy(edges: NDArray[np.int64], offsets: NDArray[np.int64]) -> Graph:
         """:meth:`from_edges` for the arrays that ``adaptgns._core`` returns."""
         return Graph.from_edges(torch.from_numpy(edges), torch.from_numpy(offsets))
+
+    @staticmethod
+    def for_inference(edges: NDArray[np.int64], offsets: NDArray[np.int64]) -> Graph:
+        """The graph of the arrays that ``adaptgns._core`` returns, without what only the backward
+        pass needs."""
+        senders, receivers = torch.from_numpy(edges)
+        return Graph(senders, receivers, torch.from_numpy(offsets))
 
     @staticmethod
     def from_edges(edges: Tensor, offsets: Tensor) -> Graph:
@@ -48,11 +57,14 @@ class Graph:
 
     def to(self, device: torch.device, *, non_blocking: bool = False) -> Graph:
         """The same graph on another device."""
-        return Graph(*(t.to(device, non_blocking=non_blocking) for t in vars(self).values()))
+        return self._with(lambda part: part.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> Graph:
         """The same graph in page-locked memory, for asynchronous copies to a GPU."""
-        return Graph(*(t.pin_memory() for t in vars(self).values()))
+        return self._with(lambda part: part.pin_memory())
+
+    def _with(self, change: Callable[[Tensor], Tensor]) -> Graph:
+        return Graph(*(change(part) for part in vars(self).values() if part is not None))
 
 
 class _SegmentSum(torch.autograd.Function):
@@ -91,6 +103,8 @@ def sum_at_receivers(edges: Tensor, graph: Graph) -> Tensor:
 
 def at_senders(nodes: Tensor, graph: Graph) -> Tensor:
     """Every edge's sender row: ``[N, F]`` to ``[E, F]``."""
+    if graph.by_sender is None:
+        return nodes.index_select(0, graph.senders)
     out: Tensor = _Gather.apply(nodes, graph.senders, graph.by_sender, graph.sender_offsets)
     return out
 

@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from adaptgns.config import HISTORY, TYPE_EMBEDDING, ModelConfig
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectory import PARTICLE_TYPES
 from adaptgns.network import EncodeProcessDecode, Prediction
 from adaptgns.segment import Graph
+
+RELATIVE_SPEED = 0.2
+"""How far neighbours' velocities differ, as a share of the velocities' std: the scale of their
+difference as a feature."""
 
 
 class Simulator(nn.Module):
@@ -39,7 +44,7 @@ class Simulator(nn.Module):
             + 2 * len(open_axes)
             + TYPE_EMBEDDING
             + metadata.material_properties,
-            edge_features=dim + 1,
+            edge_features=(dim + 1) * (2 if config.relative_motion else 1),
             outputs=dim,
             latent=config.latent,
             hidden_layers=config.hidden_layers,
@@ -96,10 +101,14 @@ class Simulator(nn.Module):
     def node_features(
         self, window: Tensor, particle_type: Tensor, material: Tensor | None = None
     ) -> Tensor:
-        """Features ``[N, :]`` of positions ``[N, H, d]``: the H - 1 velocities, the clipped
-        distances to the open bounds over the radius, the type's embedding, the material."""
+        """Features ``[N, :]`` of positions ``[N, H, d]``: the H - 1 velocities (with
+        ``relative_motion`` the last one and the H - 2 accelerations), the clipped distances to the
+        open bounds over the radius, the type's embedding, the material."""
         velocity = self.displacement(window[:, 1:], window[:, :-1])  # [N, H-1, d]
         normalized = (velocity - self.velocity_mean) / self.velocity_std
+        if self.config.relative_motion:
+            acceleration = (velocity.diff(dim=1) - self.acceleration_mean) / self.acceleration_std
+            normalized = torch.cat([acceleration, normalized[:, -1:]], dim=1)
         current = window[:, -1, self.open_axes]
         distance = torch.cat([current - self.lower, self.upper - current], dim=1)
         parts = [
@@ -111,11 +120,21 @@ class Simulator(nn.Module):
             parts.append(material)
         return torch.cat(parts, dim=1)
 
-    def edge_features(self, positions: Tensor, graph: Graph) -> Tensor:
-        """(sender - receiver) / radius and its norm, ``[E, d + 1]``, of positions ``[N, d]``."""
-        sender, receiver = positions[graph.senders], positions[graph.receivers]
-        displacement = self.displacement(sender, receiver) / self.radius
-        return torch.cat([displacement, displacement.norm(dim=1, keepdim=True)], dim=1)
+    def edge_features(self, window: Tensor, graph: Graph) -> Tensor:
+        """Features ``[E, :]`` of positions ``[N, H, d]``: (sender - receiver) / radius and its
+        norm; with ``relative_motion`` also the difference of the last velocities and its part
+        along the edge."""
+        positions, senders, receivers = window[:, -1], graph.senders, graph.receivers
+        displacement = self.displacement(positions[senders], positions[receivers]) / self.radius
+        parts = [displacement, displacement.norm(dim=1, keepdim=True)]
+        if self.config.relative_motion:
+            velocity = self.displacement(positions, window[:, -2])
+            relative = (velocity[senders] - velocity[receivers]) / (
+                RELATIVE_SPEED * self.velocity_std
+            )
+            direction = functional.normalize(displacement, dim=1, eps=1e-3)
+            parts += [relative, (relative * direction).sum(dim=1, keepdim=True)]
+        return torch.cat(parts, dim=1)
 
     def forward(
         self,
@@ -126,7 +145,7 @@ class Simulator(nn.Module):
     ) -> Prediction:
         """The normalized acceleration of every particle of ``window`` ``[N, H, d]``."""
         nodes = self.node_features(window, particle_type, material)
-        edges = None if graph is None else self.edge_features(window[:, -1], graph)
+        edges = None if graph is None else self.edge_features(window, graph)
         return self.network(nodes, edges, graph)  # type: ignore[no-any-return]
 
     def advance(self, window: Tensor, acceleration: Tensor) -> Tensor:

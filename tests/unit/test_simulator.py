@@ -58,11 +58,44 @@ def test_node_features(simulator: Simulator, metadata: Metadata) -> None:
 def test_edge_features_point_from_receiver_to_sender(simulator: Simulator) -> None:
     positions = np.array([[0.5, 0.5], [0.51, 0.5]], np.float32)
     graph = graph_of(positions, 0.015, self_edges=False)
-    features = simulator.edge_features(torch.from_numpy(positions), graph)
+    window = torch.from_numpy(positions)[:, None].expand(2, 6, 2)
+    features = simulator.edge_features(window, graph)
     into_first = features[graph.receivers == 0]
     torch.testing.assert_close(
         into_first, torch.tensor([[2 / 3, 0.0, 2 / 3]]), rtol=1e-4, atol=1e-6
     )
+
+
+def test_relative_motion(metadata: Metadata) -> None:
+    """A pair that closes in along x while both fall."""
+    config = replace(SMALL, relative_motion=True)
+    simulator = Simulator(config, metadata, noise=3e-4, variance=True)
+    velocity = torch.tensor([[1e-3, -2e-3], [-1e-3, -2e-3]])
+    fall = torch.tensor([0.0, -1e-4])
+    window = torch.empty(2, 6, 2)
+    window[:, -1] = torch.tensor([[0.5, 0.5], [0.51, 0.5]])
+    for k in range(4, -1, -1):
+        window[:, k] = window[:, k + 1] - velocity + (4 - k) * fall
+    graph = graph_of(window[:, -1].numpy(), 0.015, self_edges=True)
+    speed = 0.2 * (torch.tensor(metadata.velocity_std) ** 2 + 3e-4**2).sqrt()
+
+    edges = simulator.edge_features(window, graph)
+    pair = edges[(graph.receivers == 0) & (graph.senders == 1)][0]
+    closing = -2e-3 / speed[0]
+    expected = torch.stack([closing, torch.tensor(0.0), closing])
+    torch.testing.assert_close(pair[:3], torch.tensor([2 / 3, 0, 2 / 3]), rtol=0, atol=1e-4)
+    torch.testing.assert_close(pair[3:], expected, rtol=0, atol=1e-3)
+    assert (edges[graph.receivers == graph.senders] == 0).all()
+
+    nodes = simulator.node_features(window, types(2))
+    accelerations = nodes[:, :8].unflatten(1, (4, 2))
+    mean, std = simulator.acceleration_mean, simulator.acceleration_std
+    torch.testing.assert_close(
+        accelerations, ((fall - mean) / std).expand(2, 4, 2), rtol=0, atol=2e-3
+    )
+    mean, std = simulator.velocity_mean, simulator.velocity_std
+    torch.testing.assert_close(nodes[:, 8:10], (velocity - mean) / std, rtol=0, atol=1e-3)
+    assert simulator(window, types(2), graph).acceleration.isfinite().all()
 
 
 def test_batched_equals_single(simulator: Simulator) -> None:
