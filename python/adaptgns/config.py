@@ -168,6 +168,9 @@ class TrainConfig:
     """Std of the random-walk noise on the last input velocity (length per frame)."""
     position_correction: float = 0.0
     """Share of the last position's noise that the target undoes in one frame; 0: none, as GNS."""
+    compression: float = 0.0
+    """Scale of the strain of smooth random compressions, to which the target adds the acceleration
+    that undoes them; 0: none, as GNS."""
     mirror: bool = False
     """Reflect every other sample along the first axis (for physics that is symmetric there)."""
     seed: int = 0
@@ -203,6 +206,7 @@ class TrainConfig:
             clip=POSITIVE,
             noise=NOT_NEGATIVE,
             position_correction=SHARE,
+            compression=SHARE,
             seed=NOT_NEGATIVE,
             workers=NOT_NEGATIVE,
             threads=COUNT,

@@ -1,4 +1,4 @@
-"""Training noise: a random walk on the input velocities (Sanchez-Gonzalez et al. 2020, A.2)."""
+"""Training noise: what the errors of a rollout look like, and what they are answered with."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 def random_walk_noise(
     rng: np.random.Generator, frames: int, particles: int, dim: int, std: float
 ) -> NDArray[np.float32]:
-    """Position noise ``[frames, particles, dim]`` whose velocity noise is a random walk.
+    """Position noise ``[frames, particles, dim]`` whose velocity noise is a random walk
+    (Sanchez-Gonzalez et al. 2020, A.2).
 
     The walk over the ``frames - 1`` velocities has independent steps of std
     ``std / sqrt(frames - 1)``, so that the last velocity's noise has std ``std`` (length per
@@ -20,3 +21,60 @@ def random_walk_noise(
     noise = np.zeros((frames, particles, dim), dtype=np.float32)
     np.cumsum(velocity_noise, axis=0, out=noise[1:])
     return noise
+
+
+WAVES = 3
+"""Standing waves that a compression is made of."""
+STRONGEST = 0.1
+"""Share of a compression that the answering acceleration takes back per frame squared, at most."""
+
+
+def compression(
+    rng: np.random.Generator,
+    positions: NDArray[np.float32],
+    bounds: NDArray[np.float64],
+    periodic: tuple[bool, ...],
+    *,
+    strain: float,
+    radius: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A smooth compression of ``positions`` ``[N, d]``, and the acceleration that answers it.
+
+    Random-walk noise is new for every particle, and says nothing of errors that neighbours share:
+    a model that brakes a falling block too late piles it up, all of it, and solver data hold no
+    piles to learn from. The compression is the gradient of a few standing waves, of 4 ``radius``
+    to twice the extent of ``bounds`` ``[d, 2]`` in length, that move nothing across a wall. The
+    acceleration is that of a fluid in which sound crosses half a ``radius`` per frame, bounded
+    where the waves are short.
+
+    Args:
+        strain: scale of the relative change of density, drawn anew (half-normal) at each call.
+
+    Returns:
+        displacement (length) and acceleration (length per frame squared), each ``[N, d]``.
+    """
+    low, extent = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
+    phase = np.pi * (positions - low) / extent  # [N, d]
+    amplitude = strain * abs(rng.normal()) / np.sqrt(WAVES)
+    displacement = np.zeros(positions.shape)
+    acceleration = np.zeros(positions.shape)
+    for _ in range(WAVES):
+        # Half waves along each axis, log-uniform; whole ones where the axis is periodic.
+        most = np.maximum(extent / (2 * radius), 1)
+        halves = np.floor(most ** rng.random(len(extent))) * (rng.random(len(extent)) < 0.8)
+        halves = np.where(periodic, 2 * np.ceil(halves / 2), halves)
+        sign = rng.choice([-1, 1])
+        wave = np.pi * halves / extent
+        square = (wave**2).sum()
+        if square == 0:
+            continue
+        cosines = np.cos(phase * halves)
+        gradient = np.empty(positions.shape)
+        for axis in range(len(extent)):
+            others = np.delete(cosines, axis, axis=1).prod(axis=1)
+            gradient[:, axis] = -wave[axis] * np.sin(phase[:, axis] * halves[axis]) * others
+        part = sign * amplitude / square * gradient
+        displacement += part
+        stiffness = (radius / 2) ** 2 * square
+        acceleration -= stiffness / (1 + stiffness / STRONGEST) * part
+    return displacement.astype(np.float32), acceleration.astype(np.float32)

@@ -17,7 +17,7 @@ from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint
 from adaptgns.command import plain_errors
 from adaptgns.config import PolicyName, RolloutConfig, TrainConfig, from_json, to_json
 from adaptgns.data.check import check_split
-from adaptgns.data.default import dataset_folder
+from adaptgns.data.default import EMBEDDED, dataset_folder
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.evaluate import evaluate
@@ -102,6 +102,8 @@ def train(config: TrainConfig, console: Console) -> Path:
         f"{trainer.device.type}; run folder {folder}",
         highlight=False,
     )
+    if config.data not in EMBEDDED and checkpoint is None:
+        _tell_assumptions(config, console)
     trainer.run(console)
     try:
         report(folder, data, config, console)
@@ -111,6 +113,16 @@ def train(config: TrainConfig, console: Console) -> Path:
             f"  python -m adaptgns.train --resume {folder}"
         ) from None
     return folder
+
+
+def _tell_assumptions(config: TrainConfig, console: Console) -> None:
+    """What a preset takes for granted that not all data have."""
+    for assumed, what, option in (
+        (config.model.walls, "solid walls at the bounds", "--model.no-walls"),
+        (config.mirror, "physics that is symmetric along the first axis", "--no-mirror"),
+    ):
+        if assumed:
+            console.print(f"assuming {what}; {option} if that is wrong", highlight=False)
 
 
 def run_folder(config: TrainConfig) -> Path:

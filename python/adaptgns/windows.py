@@ -23,7 +23,7 @@ from adaptgns._core import radius_graph
 from adaptgns.config import HISTORY, TrainConfig
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
-from adaptgns.noise import random_walk_noise
+from adaptgns.noise import compression, random_walk_noise
 from adaptgns.segment import Graph
 
 Key = tuple[int, int]
@@ -122,6 +122,17 @@ class Windows(Dataset[Sample]):
             # The following position moves along, so that the target undoes the noise of the last
             # velocity and of that of the last position only the share asked for.
             positions[-1] += walk[-1] * np.float32(1 - self.config.position_correction)
+        if self.noise > 0 and self.config.compression > 0:
+            displacement, acceleration = compression(
+                rng,
+                positions[-2],
+                np.array(self.metadata.bounds),
+                self.metadata.periodic,
+                strain=self.config.compression,
+                radius=self.metadata.radius,
+            )
+            positions += displacement * mobile[:, None]
+            positions[-1] += acceleration * mobile[:, None]
         return Sample(positions, window.particle_type, window.material_property)
 
     def collate(self, samples: Sequence[Sample]) -> Batch:

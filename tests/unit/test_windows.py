@@ -141,3 +141,18 @@ def test_position_correction_undoes_its_share(windows: Windows) -> None:
     np.testing.assert_array_equal(corrected[:-1], plain[:-1])
     noise = plain[-2] - clean[-2]
     np.testing.assert_allclose(corrected[-1] - clean[-1], 0.75 * noise, atol=1e-7)
+
+
+def test_compression_moves_all_frames_alike_and_the_target_answers(windows: Windows) -> None:
+    config = replace(windows.config, compression=0.2)
+    compressed = Windows(windows.trajectories, windows.metadata, config, noise=3e-4)
+    difference = compressed[0, 5].positions - windows[0, 5].positions
+    displacement = difference[0]
+    assert np.abs(displacement).max() > 1e-4
+    for frame in difference[1:-1]:
+        np.testing.assert_allclose(frame, displacement, rtol=0, atol=1e-6)
+    answer = difference[-1] - displacement
+    assert (answer * displacement).sum() < 0
+    clean = Windows(windows.trajectories, windows.metadata, config, noise=0.0)
+    plain = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
+    assert np.array_equal(clean[0, 5].positions, plain[0, 5].positions)
