@@ -3,8 +3,9 @@
 use std::mem::MaybeUninit;
 
 use super::Graph;
+use super::lanes::{Lanes, Work, widest};
 use super::memory::Budget;
-use super::order::write_sorted;
+use super::order::{NONE, write_sorted};
 use crate::Error;
 use crate::threads::{self, Threads};
 
@@ -110,33 +111,52 @@ pub(super) fn assemble(
         let first = t * TASK;
         let offsets = &offsets[first..=first + rows.len()];
         let edges = (offsets[rows.len()] - offsets[0]) as usize;
-        let senders = senders.split_off_mut(..edges).expect("edges left");
-        let receivers = receivers.split_off_mut(..edges).expect("edges left");
-        tasks.push((first, rows, offsets, senders, receivers));
+        tasks.push(Writing {
+            first: first as i32,
+            rows,
+            offsets,
+            drop_self,
+            senders: senders.split_off_mut(..edges).expect("edges left"),
+            receivers: receivers.split_off_mut(..edges).expect("edges left"),
+        });
     }
-    threads::map(
-        threads,
-        tasks,
-        |(first, rows, offsets, senders, receivers)| {
-            let counts = offsets.windows(2).map(|pair| (pair[1] - pair[0]) as usize);
-            let mut at = 0;
-            for ((receiver, row), count) in (first as i32..).zip(rows).zip(counts) {
-                if drop_self {
-                    write_sorted(row, count + 1, receiver, &mut senders[at..]);
-                } else {
-                    write_sorted(row, count, -1, &mut senders[at..]);
-                }
-                fill(&mut receivers[at..], count, i64::from(receiver));
-                at += count;
-            }
-        },
-    );
+    threads::map(threads, tasks, widest);
     // SAFETY: the tasks' rows partition both halves, and each wrote all of its part.
     unsafe { edge_index.set_len(2 * edges) };
     Ok(Graph {
         edge_index,
         offsets,
     })
+}
+
+/// The rows of some receivers, and their place in the edge list.
+struct Writing<'a> {
+    first: i32,
+    rows: &'a [&'a [i32]],
+    offsets: &'a [i64],
+    drop_self: bool,
+    senders: &'a mut [MaybeUninit<i64>],
+    receivers: &'a mut [MaybeUninit<i64>],
+}
+
+impl Work for Writing<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<L: Lanes>(self, lanes: L) {
+        let counts = self
+            .offsets
+            .windows(2)
+            .map(|pair| (pair[1] - pair[0]) as usize);
+        let mut at = 0;
+        for ((receiver, row), count) in (self.first..).zip(self.rows).zip(counts) {
+            let dropped = if self.drop_self { receiver } else { NONE };
+            let found = count + usize::from(self.drop_self);
+            write_sorted(lanes, row, found, dropped, &mut self.senders[at..]);
+            fill(&mut self.receivers[at..], count, i64::from(receiver));
+            at += count;
+        }
+    }
 }
 
 /// Writes `count` times `value` to the front of `out`: in whole blocks where there is

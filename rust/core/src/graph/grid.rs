@@ -8,7 +8,8 @@
 
 use std::ops::Range;
 
-use super::scalar::{BLOCK, Scalar};
+use super::lanes::BLOCK;
+use super::scalar::Scalar;
 
 /// Above this many cells per particle (plus a constant) a grid stores occupied rows only.
 const MOST_CELLS_PER_PARTICLE: usize = 16;

@@ -20,6 +20,7 @@ mod edges;
 mod grid;
 mod input;
 mod knn;
+mod lanes;
 mod memory;
 mod order;
 mod radius;

@@ -2,44 +2,39 @@
 
 use std::mem::MaybeUninit;
 
+use super::lanes::{BLOCK, Lanes};
+
 /// Longest row that is sorted by ranks.
 const RANKED: usize = 64;
 
-/// Senders that are ranked together.
-const KEYS: usize = 8;
+/// Stands for no sender: larger than any.
+pub(super) const NONE: i32 = i32::MAX;
 
 /// Writes the first `n` of `row`, which are distinct, in ascending order to the front of
-/// `out`, without `dropped` if that is among them. One place behind them may be
-/// overwritten, and `row` has room for [`KEYS`] more behind its contents.
+/// `out`, without `dropped`, which is one of them or [`NONE`]. `row` goes on for a block
+/// behind its contents, and in `out` one place behind them may be overwritten.
 ///
 /// In a short row each sender's place is the number of smaller ones. That is quadratic,
-/// but several comparisons go to an instruction, and no branch depends on their outcome
-/// or, but for whole blocks, on `n`.
+/// but several comparisons go to an instruction, and no branch depends on their outcome.
 #[inline(always)]
-pub(super) fn write_sorted(row: &[i32], n: usize, dropped: i32, out: &mut [MaybeUninit<i64>]) {
+pub(super) fn write_sorted<L: Lanes>(
+    lanes: L,
+    row: &[i32],
+    n: usize,
+    dropped: i32,
+    out: &mut [MaybeUninit<i64>],
+) {
     if n > RANKED {
         return write_sorted_long(&row[..n], dropped, out);
     }
-    // Whatever is not to be written comes last.
-    let mut keys = [i32::MAX; RANKED];
-    for start in (0..n).step_by(KEYS) {
-        let found: &[i32; KEYS] = row[start..].first_chunk().expect("room");
-        for l in 0..KEYS {
-            let absent = (l as i32 >= (n - start) as i32) | (found[l] == dropped);
-            keys[start + l] = if absent { i32::MAX } else { found[l] };
-        }
-    }
-    for start in (0..n).step_by(KEYS) {
-        let block: &[i32; KEYS] = keys[start..].first_chunk().expect("room");
-        let mut places = [0; KEYS];
-        for &other in &keys[..n] {
-            for l in 0..KEYS {
-                places[l] += i32::from(block[l] > other);
-            }
-        }
-        for l in 0..KEYS {
-            if let Some(slot) = out.get_mut(places[l] as usize) {
-                slot.write(i64::from(block[l]));
+    for start in (0..n).step_by(BLOCK) {
+        let keys: &[i32; BLOCK] = row[start..].first_chunk().expect("room");
+        let smaller = lanes.count_smaller(keys, &row[..n]);
+        for (&key, &smaller) in keys.iter().zip(&smaller).take(n - start) {
+            let place = smaller as usize - usize::from(key > dropped);
+            let place = if key == dropped { n - 1 } else { place };
+            if let Some(slot) = out.get_mut(place) {
+                slot.write(i64::from(key));
             }
         }
     }

@@ -2,14 +2,13 @@
 
 use std::ops::{Add, Mul, Sub};
 
+use super::lanes::BLOCK;
+
 mod sealed {
     pub trait Sealed {}
     impl Sealed for f32 {}
     impl Sealed for f64 {}
 }
-
-/// Numbers that are compared together.
-pub(super) const BLOCK: usize = 8;
 
 /// `f32` or `f64`: what positions and uncertainties are given in, and the arithmetic
 /// that decides about an edge.

@@ -9,8 +9,9 @@ use std::ops::Range;
 use super::edges::Rows;
 use super::grid::Grid;
 use super::input::Batch;
+use super::lanes::{BLOCK, Lanes, Work, widest};
 use super::memory::Budget;
-use super::scalar::{BLOCK, Scalar};
+use super::scalar::Scalar;
 use crate::Error;
 
 /// A checked [`Radius`](super::Radius).
@@ -81,49 +82,29 @@ impl<T: Scalar, const D: usize> Search<T, D> {
     /// The rows of the sorted particles `slots`, every one among its own neighbours.
     pub fn run(&self, slots: Range<usize>, budget: &Budget) -> Result<Rows, Error> {
         let periodic = self.period.iter().any(|length| length.is_finite());
-        match (periodic, &self.limits) {
-            (false, Limits::Uniform(_)) => self.search::<false, true>(slots, budget),
-            (false, _) => self.search::<false, false>(slots, budget),
-            (true, Limits::Uniform(_)) => self.search::<true, true>(slots, budget),
-            (true, _) => self.search::<true, false>(slots, budget),
+        let (search, uniform) = (self, matches!(self.limits, Limits::Uniform(_)));
+        match (periodic, uniform) {
+            (false, true) => widest(Pass::<T, D, false, true> {
+                search,
+                slots,
+                budget,
+            }),
+            (false, false) => widest(Pass::<T, D, false, false> {
+                search,
+                slots,
+                budget,
+            }),
+            (true, true) => widest(Pass::<T, D, true, true> {
+                search,
+                slots,
+                budget,
+            }),
+            (true, false) => widest(Pass::<T, D, true, false> {
+                search,
+                slots,
+                budget,
+            }),
         }
-    }
-
-    fn search<const PERIODIC: bool, const UNIFORM: bool>(
-        &self,
-        slots: Range<usize>,
-        budget: &Budget,
-    ) -> Result<Rows, Error> {
-        let index = &self.grid.index;
-        let mut rows = Rows::with_receivers(slots.len());
-        let mut cells = self.grid.cells(slots);
-        while let Some(receivers) = cells.next() {
-            let most = cells.runs().iter().map(Range::len).sum();
-            for receiver in receivers {
-                let near = self.near::<PERIODIC, UNIFORM>(receiver);
-                let row = rows.next(most, budget)?.as_mut_ptr();
-                let mut n = 0;
-                for run in cells.runs() {
-                    let mut start = run.start;
-                    while start < run.end {
-                        let beyond = BLOCK - BLOCK.min(run.end - start);
-                        // SAFETY: `start` is a sorted particle, behind the last of which
-                        // the arrays have room for a block, and so has the row behind
-                        // `most` senders.
-                        n += unsafe {
-                            append(
-                                near(start) & (u8::MAX >> beyond),
-                                block(index, start),
-                                row.add(n).cast(),
-                            )
-                        };
-                        start += BLOCK;
-                    }
-                }
-                rows.finish(n);
-            }
-        }
-        Ok(rows)
     }
 
     /// A function that tells which sorted particles are within the cutoff of `receiver`:
@@ -161,6 +142,53 @@ impl<T: Scalar, const D: usize> Search<T, D> {
     }
 }
 
+/// The search of some of the sorted particles.
+struct Pass<'a, T, const D: usize, const PERIODIC: bool, const UNIFORM: bool> {
+    search: &'a Search<T, D>,
+    slots: Range<usize>,
+    budget: &'a Budget,
+}
+
+impl<T: Scalar, const D: usize, const PERIODIC: bool, const UNIFORM: bool> Work
+    for Pass<'_, T, D, PERIODIC, UNIFORM>
+{
+    type Output = Result<Rows, Error>;
+
+    #[inline(always)]
+    fn run<L: Lanes>(self, lanes: L) -> Self::Output {
+        let Grid { index, .. } = &self.search.grid;
+        let mut rows = Rows::with_receivers(self.slots.len());
+        let mut cells = self.search.grid.cells(self.slots);
+        while let Some(receivers) = cells.next() {
+            let most = cells.runs().iter().map(Range::len).sum();
+            for receiver in receivers {
+                let near = self.search.near::<PERIODIC, UNIFORM>(receiver);
+                let row = rows.next(most, self.budget)?.as_mut_ptr();
+                let mut n = 0;
+                for run in cells.runs() {
+                    let mut start = run.start;
+                    while start < run.end {
+                        let beyond = BLOCK - BLOCK.min(run.end - start);
+                        // SAFETY: `start` is a sorted particle, behind the last of which
+                        // the arrays have room for a block, and so has the row behind
+                        // `most` senders.
+                        n += unsafe {
+                            lanes.append(
+                                near(start) & (u8::MAX >> beyond),
+                                block(index, start),
+                                row.add(n).cast(),
+                            )
+                        };
+                        start += BLOCK;
+                    }
+                }
+                rows.finish(n);
+            }
+        }
+        Ok(rows)
+    }
+}
+
 /// Distance along one axis, up to its sign: on a periodic one to the nearest image of a
 /// position that is inside the box like the other. Swapping the two changes nothing but
 /// the sign, so both directions of a pair fall the same way.
@@ -184,48 +212,4 @@ unsafe fn block<T>(values: &[T], start: usize) -> &[T; BLOCK] {
     debug_assert!(start + BLOCK <= values.len());
     // SAFETY: promised by the caller.
     unsafe { &*values.as_ptr().add(start).cast() }
-}
-
-/// For each byte, the places of its ones from the lowest, and how many there are.
-static ONES: [([u8; BLOCK], u8); 256] = {
-    let mut table = [([0; BLOCK], 0); 256];
-    let mut byte = 0;
-    while byte < 256 {
-        let mut place = 0;
-        while place < BLOCK {
-            if byte >> place & 1 == 1 {
-                let (places, count) = &mut table[byte];
-                places[*count as usize] = place as u8;
-                *count += 1;
-            }
-            place += 1;
-        }
-        byte += 1;
-    }
-    table
-};
-
-/// Writes those of `index` whose bit in `near` is set to `end`, and returns how many.
-/// As many are written as there often are, and those count that there are.
-///
-/// # Safety
-/// There is room for a block at `end`.
-#[inline(always)]
-unsafe fn append(near: u8, index: &[i32; BLOCK], end: *mut [i32; BLOCK]) -> usize {
-    const OFTEN: usize = BLOCK / 2;
-    let (places, count) = &ONES[usize::from(near)];
-    let count = usize::from(*count);
-    // SAFETY: promised by the caller.
-    let end = unsafe { &mut *end };
-    // SAFETY: the table's places lie inside a block.
-    let at = |l: usize| unsafe { *index.get_unchecked(usize::from(places[l])) };
-    for l in 0..OFTEN {
-        end[l] = at(l);
-    }
-    if count > OFTEN {
-        for l in OFTEN..BLOCK {
-            end[l] = at(l);
-        }
-    }
-    count
 }
