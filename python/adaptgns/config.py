@@ -166,6 +166,9 @@ class TrainConfig:
     """Largest gradient norm; None: unlimited."""
     noise: float = 6.7e-4
     """Std of the random-walk noise on the last input velocity (length per frame)."""
+    drift: float = 0.0
+    """Scale of the noise on the accelerations before the last velocity that all particles of a
+    sample share (length per frame squared); 0: none, as GNS."""
     position_correction: float = 0.0
     """Share of the last position's noise that the target undoes in one frame; 0: none, as GNS."""
     compression: float = 0.0
@@ -205,6 +208,7 @@ class TrainConfig:
             warmup=NOT_NEGATIVE,
             clip=POSITIVE,
             noise=NOT_NEGATIVE,
+            drift=NOT_NEGATIVE,
             position_correction=SHARE,
             compression=SHARE,
             seed=NOT_NEGATIVE,

@@ -23,6 +23,22 @@ def random_walk_noise(
     return noise
 
 
+def drift_noise(rng: np.random.Generator, frames: int, dim: int, std: float) -> NDArray[np.float32]:
+    """Position noise ``[frames, dim]`` that all particles of a sample share, in their past alone.
+
+    The accelerations before the last velocity are off by a common vector plus half as much anew
+    at each frame, their scale ``std`` (length per frame squared) times a half-normal number; the
+    last two positions, and so the last velocity, carry none. Neighbours cannot tell such noise
+    from the truth. Without it a model learns to repeat the last acceleration, and in a rollout
+    keeps up its own errors: a drop that falls freely slows down in mid-air.
+    """
+    scale = std * abs(rng.normal())
+    common = rng.normal(size=dim)
+    acceleration = scale * (common + 0.5 * rng.normal(size=(frames - 2, dim)))
+    past = np.cumsum(np.cumsum(acceleration, axis=0), axis=0)  # the newest first
+    return np.concatenate([past[::-1], np.zeros((2, dim))]).astype(np.float32)
+
+
 WAVES = 3
 """Standing waves that a compression is made of."""
 STRONGEST = 0.1

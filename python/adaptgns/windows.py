@@ -23,7 +23,7 @@ from adaptgns._core import radius_graph
 from adaptgns.config import HISTORY, TrainConfig
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
-from adaptgns.noise import compression, random_walk_noise
+from adaptgns.noise import compression, drift_noise, random_walk_noise
 from adaptgns.segment import Graph
 
 Key = tuple[int, int]
@@ -115,25 +115,40 @@ class Windows(Dataset[Sample]):
         if self.config.mirror and rng.random() < 0.5:
             positions[..., 0] = np.float32(sum(self.metadata.bounds[0])) - positions[..., 0]
         if self.noise > 0:
-            _, particles, dim = positions.shape
-            walk = random_walk_noise(rng, HISTORY, particles, dim, self.noise)
-            walk *= mobile[:, None]
-            positions[-HISTORY - 1 : -1] += walk
-            # The following position moves along, so that the target undoes the noise of the last
-            # velocity and of that of the last position only the share asked for.
-            positions[-1] += walk[-1] * np.float32(1 - self.config.position_correction)
-        if self.noise > 0 and self.config.compression > 0:
+            self._add_noise(rng, positions, mobile)
+        return Sample(positions, window.particle_type, window.material_property)
+
+    def _add_noise(
+        self,
+        rng: np.random.Generator,
+        positions: NDArray[np.float32],
+        mobile: NDArray[np.bool_],
+    ) -> None:
+        """Add noise to the inputs among ``positions`` ``[F, N, d]``, and to the position that
+        follows what the target is to answer it with."""
+        config = self.config
+        inputs, following = positions[-HISTORY - 1 : -1], positions[-1]
+        _, particles, dim = positions.shape
+        walk = random_walk_noise(rng, HISTORY, particles, dim, self.noise)
+        walk *= mobile[:, None]
+        inputs += walk
+        # The following position moves along, so that the target undoes the noise of the last
+        # velocity and of that of the last position only the share asked for.
+        following += walk[-1] * np.float32(1 - config.position_correction)
+        if config.drift > 0:
+            drift = drift_noise(rng, len(positions) - 1, dim, config.drift)
+            positions[:-1] += drift[:, None] * mobile[:, None]
+        if config.compression > 0:
             displacement, acceleration = compression(
                 rng,
-                positions[-2],
+                inputs[-1],
                 np.array(self.metadata.bounds),
                 self.metadata.periodic,
-                strain=self.config.compression,
+                strain=config.compression,
                 radius=self.metadata.radius,
             )
             positions += displacement * mobile[:, None]
-            positions[-1] += acceleration * mobile[:, None]
-        return Sample(positions, window.particle_type, window.material_property)
+            following += acceleration * mobile[:, None]
 
     def collate(self, samples: Sequence[Sample]) -> Batch:
         """One batch with its base graph, built on the noisy positions."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptgns.noise import compression, random_walk_noise
+from adaptgns.noise import compression, drift_noise, random_walk_noise
 
 
 def test_velocity_noise_is_a_random_walk_that_ends_at_std() -> None:
@@ -17,6 +17,18 @@ def test_velocity_noise_is_a_random_walk_that_ends_at_std() -> None:
     np.testing.assert_allclose(velocity.std((1, 2)), expected, rtol=0.02)
     increments = np.diff(velocity, axis=0).reshape(4, -1)
     np.testing.assert_allclose(np.corrcoef(increments), np.eye(4), atol=0.02)
+
+
+def test_drift_is_in_the_past_alone_and_mostly_common() -> None:
+    rng = np.random.default_rng(0)
+    noise = np.stack([drift_noise(rng, 6, 2, 3e-5) for _ in range(20_000)]).astype(np.float64)
+    assert noise.shape == (20_000, 6, 2)
+    assert (noise[:, -2:] == 0).all()
+    acceleration = np.diff(noise, n=2, axis=1)  # [samples, 4, 2]
+    # E|N|^2 = 1, and the variance of common plus half as much anew is 1.25.
+    np.testing.assert_allclose(acceleration.std((0, 2)), 3e-5 * np.sqrt(1.25), rtol=0.03)
+    between = (acceleration[:, 0] * acceleration[:, 3]).mean() / acceleration[:, 0].var()
+    assert abs(between - 1 / 1.25) < 0.03
 
 
 def lattice(spacing: float) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
