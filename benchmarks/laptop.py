@@ -1,0 +1,53 @@
+"""Train the laptop preset and the per-particle MLP as long, and put both in one table.
+
+    python benchmarks/laptop.py DATA [--out benchmarks/results/laptop_NAME.json] [-- OPTIONS]
+
+DATA is what ``python -m adaptgns.train --data`` takes, and OPTIONS are passed on to it. Runs lie in
+``runs/benchmark``; one that was interrupted goes on, one that has ended is not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from adaptgns import train
+from adaptgns.checkpoint import LAST
+from adaptgns.evaluate import METRICS, evaluate
+
+
+def rollouts(folder: Path, arguments: list[str]) -> list[Path]:
+    """The rollouts of the run in ``folder``, which is made where it is not there."""
+    if not (folder / METRICS).exists():
+        if (folder / LAST).exists():
+            arguments = ["--resume", str(folder)]
+        train.main([*arguments, *([] if "--resume" in arguments else ["--out", str(folder)])])
+    return sorted((folder / "rollouts").glob("*.h5"), reverse=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data")
+    parser.add_argument("--out", type=Path, help="where to write the figures as JSON")
+    options, rest = parser.parse_known_args(sys.argv[1:])
+    rest = [option for option in rest if option != "--"]
+    name = Path(options.data).name
+    folder = Path("runs/benchmark")
+    files = [
+        *rollouts(folder / name, ["--data", options.data, *rest]),
+        *rollouts(folder / f"{name}-mlp", ["--data", options.data, "--model.no-edges", *rest]),
+    ]
+    together = folder / f"{name}-together"
+    together.mkdir(parents=True, exist_ok=True)
+    evaluate(files, out=together, console=Console())
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(together / METRICS, options.out)
+
+
+if __name__ == "__main__":
+    main()
