@@ -9,7 +9,7 @@ DATA is what ``python -m adaptgns.train --data`` takes, and OPTIONS are passed o
 from __future__ import annotations
 
 import argparse
-import shutil
+import json
 import sys
 from pathlib import Path
 
@@ -45,8 +45,13 @@ def main() -> None:
     together.mkdir(parents=True, exist_ok=True)
     evaluate(files, out=together, console=Console())
     if options.out:
+        report = json.loads((together / METRICS).read_text())
+        for rollout in report["rollouts"]:  # where the data lay is nobody's business
+            for settings in (rollout["settings"], rollout["settings"].get("training", {})):
+                if "data" in settings:
+                    settings["data"] = Path(settings["data"]).name
         options.out.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(together / METRICS, options.out)
+        options.out.write_text(json.dumps(report) + "\n")
 
 
 if __name__ == "__main__":

@@ -12,13 +12,13 @@ from adaptgns.metrics import Floats
 from adaptgns.periodic import minimum_image
 
 AZIMUTH, ELEVATION = np.radians(-60.0), np.radians(22.0)
-"""Of the camera, around the last axis and above the plane of the others"""
+"""Of the camera, around the second axis, against which gravity acts, and above the other two"""
 MARGIN = 0.02
 """Around the bounds, as a share of their longer side"""
 
 
 class View:
-    """An orthographic projection of the domain of ``metadata``, with the last axis upwards."""
+    """An orthographic projection of the domain of ``metadata``, with the second axis upwards."""
 
     def __init__(self, metadata: Metadata) -> None:
         self._box = metadata.box
@@ -30,9 +30,9 @@ class View:
             (sin_a, cos_a), (sin_e, cos_e) = ((np.sin(x), np.cos(x)) for x in (AZIMUTH, ELEVATION))
             self._axes = np.array(
                 [
-                    [-sin_a, cos_a, 0.0],
-                    [-sin_e * cos_a, -sin_e * sin_a, cos_e],
-                    [cos_e * cos_a, cos_e * sin_a, sin_e],
+                    [-sin_a, 0.0, -cos_a],
+                    [-sin_e * cos_a, cos_e, sin_e * sin_a],
+                    [cos_e * cos_a, sin_e, -cos_e * sin_a],
                 ]
             )
         corners = np.array(list(product(*zip(self._lower, self._upper, strict=True))))

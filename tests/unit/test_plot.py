@@ -109,7 +109,7 @@ def test_command(tmp_path: Path, adaptive: Path, capsys: pytest.CaptureFixture[s
         with pytest.raises(SystemExit) as stopped:
             main(["animate", "--rollout", str(adaptive), "--out", str(out), *wrong])
         assert stopped.value.code == 2
-    assert "error: every, fps: got 0" in capsys.readouterr().out
+    assert "error: every, fps: got 0" in capsys.readouterr().err
 
 
 def in_three_dimensions(metadata: Metadata) -> Metadata:
@@ -128,9 +128,12 @@ def test_view_of_three_dimensions(metadata: Metadata) -> None:
     positions = np.array([[0.2, 0.3, 0.1], [0.2, 0.3, 1.9], [0.9, 0.3, 0.1], [0.2, 0.9, 0.1]])
     points, order = view.points(positions)
     assert sorted(order) == [0, 1, 2, 3]
-    # The last axis points straight up; all that is in the bounds is in the picture.
-    assert points[1, 0] == pytest.approx(points[0, 0])
-    assert points[1, 1] > points[0, 1]
+    # The second axis points straight up; all that is in the bounds is in the picture.
+    assert points[3, 0] == pytest.approx(points[0, 0])
+    assert points[3, 1] > points[0, 1]
+    # From the front right corner: x goes right, and z out of the picture.
+    assert points[2, 0] > points[0, 0]
+    assert list(order).index(1) > list(order).index(0)
     corners = view.frame.reshape(-1, 2)
     assert len(view.frame) == 12
     assert (corners > view.lower).all()
