@@ -20,6 +20,10 @@ from adaptgns.checkpoint import LAST
 from adaptgns.evaluate import METRICS, evaluate
 
 
+def six_digits(number: str) -> float:
+    return float(f"{float(number):.6g}")
+
+
 def rollouts(folder: Path, arguments: list[str]) -> list[Path]:
     """The rollouts of the run in ``folder``, which is made where it is not there."""
     if not (folder / METRICS).exists():
@@ -45,7 +49,7 @@ def main() -> None:
     together.mkdir(parents=True, exist_ok=True)
     evaluate(files, out=together, console=Console())
     if options.out:
-        report = json.loads((together / METRICS).read_text())
+        report = json.loads((together / METRICS).read_text(), parse_float=six_digits)
         for rollout in report["rollouts"]:  # where the data lay is nobody's business
             for settings in (rollout["settings"], rollout["settings"].get("training", {})):
                 if "data" in settings:
