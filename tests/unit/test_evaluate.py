@@ -182,4 +182,4 @@ def test_command(tmp_path: Path, metadata: Metadata, capsys: pytest.CaptureFixtu
     with pytest.raises(SystemExit) as stopped:
         main(["--rollouts", str(tmp_path / "none.h5")])
     assert stopped.value.code == 2
-    assert "there is no such file" in capsys.readouterr().out.replace("\n", " ")
+    assert "there is no such file" in capsys.readouterr().err
