@@ -76,9 +76,10 @@ def test_wrong_arguments_are_named(
 def test_a_run_is_resumed_with_what_its_weights_are_made_for(
     drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    main(["--preset", "smoke", "--data", str(drops), "--out", str(tmp_path), "--steps", "2"])
+    main(["--preset", "smoke", "--data", str(drops), "--out", str(tmp_path), "--steps", "2",
+          "--mirror"])  # fmt: skip
+    assert "assuming physics that is symmetric" in capsys.readouterr().out
     saved = (tmp_path / "config.json").read_bytes()
-    capsys.readouterr()
     with pytest.raises(SystemExit) as exit_:
         main(["--resume", str(tmp_path), "--loss", "mse"])
     assert exit_.value.code == 2
