@@ -3,7 +3,8 @@
     python benchmarks/laptop.py DATA [--out benchmarks/results/laptop_NAME.json] [-- OPTIONS]
 
 DATA is what ``python -m adaptgns.train --data`` takes, and OPTIONS are passed on to it. Runs lie in
-``runs/benchmark``; one that was interrupted goes on, one that has ended is not repeated.
+``runs/benchmark``; one that was interrupted goes on, and one that has ended is not repeated, with
+other options neither, until its folder is removed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What every command does about errors that are its user's to mend."""
+"""What commands do about errors that are their user's to mend."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ def plain_errors(*also: type[Exception]) -> Iterator[None]:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None
     except told as error:
-        print(f"error: {error or type(error).__name__}", file=sys.stderr)
+        print(f"error: {str(error) or type(error).__name__}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -44,7 +44,7 @@ LOG_EVERY = 100
 
 
 class TrainingStopped(Exception):  # noqa: N818 (not an error: nothing is lost)
-    """Training ended before its last step; the message says why and how to go on."""
+    """A run ended before its end; the message says why and how to go on."""
 
 
 class Trainer:
@@ -81,9 +81,12 @@ class Trainer:
             )
 
     def _restore(self, checkpoint: Checkpoint) -> None:
-        for name in ("model", "loss", "noise"):
-            saved, given = getattr(checkpoint.config, name), getattr(self.config, name)
-            if given != saved:
+        before, now = (
+            {**vars(c.model), "loss": c.loss, "noise": c.noise}
+            for c in (checkpoint.config, self.config)
+        )
+        for name, given in now.items():
+            if given != (saved := before[name]):
                 raise ValueError(
                     f"{name}: the run was started with {saved}; got {given}; what a checkpoint's "
                     "weights are made for stays as it is, or is trained anew in another folder"

@@ -196,14 +196,14 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
-    config = tyro.cli(
-        RolloutConfig,
-        args=argv,
-        prog="python -m adaptgns.rollout",
-        config=(tyro.conf.OmitArgPrefixes,),
-    )
     console = Console()
     with plain_errors(torch.OutOfMemoryError):
+        config = tyro.cli(
+            RolloutConfig,
+            args=argv,
+            prog="python -m adaptgns.rollout",
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
         write_rollouts(config, console)
     console.print(f"{config.out}", highlight=False)
 

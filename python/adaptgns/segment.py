@@ -25,7 +25,7 @@ class Graph:
     ``senders`` and ``receivers`` are int64 ``[E]``; the edges into particle i are the rows
     ``receiver_offsets[i]:receiver_offsets[i + 1]``. ``by_sender`` ``[E]`` lists the edges sorted
     by sender, and ``sender_offsets`` ``[N + 1]`` delimits each sender's part of that list; only
-    the backward pass needs the two, and a graph for inference has None.
+    a deterministic backward pass needs the two, and a graph for inference has None.
     """
 
     senders: Tensor

@@ -120,6 +120,7 @@ def _tell_assumptions(config: TrainConfig, console: Console) -> None:
     for assumed, what, option in (
         (config.model.walls, "solid walls at the bounds", "--model.no-walls"),
         (config.mirror, "physics that is symmetric along the first axis", "--no-mirror"),
+        (config.compression > 0, "matter that resists compression", "--compression 0"),
     ):
         if assumed:
             console.print(f"assuming {what}; {option} if that is wrong", highlight=False)

@@ -114,8 +114,7 @@ class Windows(Dataset[Sample]):
         mobile = self.metadata.mobile(window.particle_type)
         if self.config.mirror and rng.random() < 0.5:
             positions[..., 0] = np.float32(sum(self.metadata.bounds[0])) - positions[..., 0]
-        if self.noise > 0:
-            self._add_noise(rng, positions, mobile)
+        self._add_noise(rng, positions, mobile)
         return Sample(positions, window.particle_type, window.material_property)
 
     def _add_noise(
@@ -129,12 +128,13 @@ class Windows(Dataset[Sample]):
         config = self.config
         inputs, following = positions[-HISTORY - 1 : -1], positions[-1]
         _, particles, dim = positions.shape
-        walk = random_walk_noise(rng, HISTORY, particles, dim, self.noise)
-        walk *= mobile[:, None]
-        inputs += walk
-        # The following position moves along, so that the target undoes the noise of the last
-        # velocity and of that of the last position only the share asked for.
-        following += walk[-1] * np.float32(1 - config.position_correction)
+        if self.noise > 0:
+            walk = random_walk_noise(rng, HISTORY, particles, dim, self.noise)
+            walk *= mobile[:, None]
+            inputs += walk
+            # The following position moves along, so that the target undoes the noise of the last
+            # velocity and of that of the last position only the share asked for.
+            following += walk[-1] * np.float32(1 - config.position_correction)
         if config.drift > 0:
             drift = drift_noise(rng, len(positions) - 1, dim, config.drift)
             positions[:-1] += drift[:, None] * mobile[:, None]

@@ -28,7 +28,7 @@ from adaptgns.config import (
 from adaptgns.data.metadata import Metadata, read_metadata
 from adaptgns.data.trajectories import Trajectory, open_split
 from adaptgns.policies import Adaptive, Fixed, make_policy
-from adaptgns.rollout import steps, write_rollouts
+from adaptgns.rollout import main, steps, write_rollouts
 from adaptgns.simulator import Simulator
 
 RULE = AdaptiveConfig(tau=70, factor=1.5)
@@ -160,3 +160,10 @@ def test_a_policy_that_the_model_cannot_follow_is_refused(
             RolloutConfig(checkpoint=tmp_path, out=out, policy=policy), Console(quiet=True)
         )
     assert not out.exists()
+
+
+def test_wrong_options_are_told_plainly(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["--checkpoint", "run", "--out", "x.h5", "--steps", "0"])
+    assert exit_.value.code == 2
+    assert "steps: got 0; accepted are whole numbers >= 1" in capsys.readouterr().err

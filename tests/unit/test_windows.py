@@ -6,6 +6,7 @@ import itertools
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -79,7 +80,8 @@ def test_target_undoes_the_noise_of_the_last_velocity(windows: Windows) -> None:
 
 def test_kinematic_particles_carry_no_noise(windows: Windows) -> None:
     all_kinematic = replace(windows.metadata, kinematic_types=(5,))
-    still = Windows(windows.trajectories, all_kinematic, windows.config, noise=3e-4)
+    config = replace(windows.config, drift=3e-5, compression=0.2)
+    still = Windows(windows.trajectories, all_kinematic, config, noise=3e-4)
     clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
     assert np.array_equal(still[0, 5].positions, clean[0, 5].positions)
     assert not still.collate([still[0, 5]]).mobile.any()
@@ -153,6 +155,18 @@ def test_compression_moves_all_frames_alike_and_the_target_answers(windows: Wind
         np.testing.assert_allclose(frame, displacement, rtol=0, atol=1e-6)
     answer = difference[-1] - displacement
     assert (answer * displacement).sum() < 0
-    clean = Windows(windows.trajectories, windows.metadata, config, noise=0.0)
-    plain = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
-    assert np.array_equal(clean[0, 5].positions, plain[0, 5].positions)
+
+
+@pytest.mark.parametrize("graph", ["base", "adaptive"])
+def test_drift_is_shared_and_leaves_the_last_velocity(
+    windows: Windows, graph: Literal["base", "adaptive"]
+) -> None:
+    plain = replace(windows.config, graph=graph)
+    clean, drifted = (
+        Windows(windows.trajectories, windows.metadata, config, noise=0.0)[0, 5].positions
+        for config in (plain, replace(plain, drift=1e-3))
+    )
+    difference = drifted - clean
+    assert np.array_equal(drifted[-3:], clean[-3:])
+    assert (np.abs(difference[:-3]).max((1, 2)) > 1e-5).all()
+    np.testing.assert_allclose(difference, difference[:, :1].repeat(len(clean[0]), 1), atol=1e-6)

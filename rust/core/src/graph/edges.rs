@@ -3,7 +3,7 @@
 use std::mem::MaybeUninit;
 
 use super::Graph;
-use super::lanes::{Lanes, Work, widest};
+use super::lanes::{BLOCK, Lanes, Work, widest};
 use super::memory::Budget;
 use super::order::{NONE, write_sorted};
 use crate::Error;
@@ -20,7 +20,7 @@ pub(super) struct Rows {
 }
 
 /// Room that there always is behind a row.
-const ROOM: usize = 8;
+const ROOM: usize = BLOCK;
 
 impl Rows {
     pub fn with_receivers(receivers: usize) -> Self {
@@ -163,7 +163,6 @@ impl Work for Writing<'_> {
 /// room, since what they write too much the next row overwrites.
 #[inline(always)]
 fn fill(out: &mut [MaybeUninit<i64>], count: usize, value: i64) {
-    const BLOCK: usize = 8;
     for start in (0..count).step_by(BLOCK) {
         let out = &mut out[start..];
         match out.first_chunk_mut::<BLOCK>() {

@@ -1,0 +1,30 @@
+"""Errors that users mend are one line, not a traceback."""
+
+from __future__ import annotations
+
+import pytest
+
+from adaptgns.command import plain_errors
+
+
+@pytest.mark.parametrize(
+    ("error", "told", "code"),
+    [
+        (ValueError("tau: got 200"), "error: tau: got 200\n", 2),
+        (MemoryError(), "error: MemoryError\n", 2),
+        (KeyboardInterrupt(), "interrupted\n", 130),
+        (IndexError("no such trajectory"), "error: no such trajectory\n", 2),
+    ],
+)
+def test_plain_errors(
+    error: BaseException, told: str, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as exit_, plain_errors(IndexError):
+        raise error
+    assert exit_.value.code == code
+    assert capsys.readouterr().err == told
+
+
+def test_bugs_keep_their_traceback() -> None:
+    with pytest.raises(IndexError), plain_errors():
+        raise IndexError
