@@ -28,9 +28,8 @@ def six_digits(number: str) -> float:
 def rollouts(folder: Path, arguments: list[str]) -> list[Path]:
     """The rollouts of the run in ``folder``, which is made where it is not there."""
     if not (folder / METRICS).exists():
-        if (folder / LAST).exists():
-            arguments = ["--resume", str(folder)]
-        train.main([*arguments, *([] if "--resume" in arguments else ["--out", str(folder)])])
+        begun = (folder / LAST).exists()
+        train.main(["--resume", str(folder)] if begun else [*arguments, "--out", str(folder)])
     return sorted((folder / "rollouts").glob("*.h5"), reverse=True)
 
 

@@ -82,29 +82,24 @@ impl<T: Scalar, const D: usize> Search<T, D> {
     /// The rows of the sorted particles `slots`, every one among its own neighbours.
     pub fn run(&self, slots: Range<usize>, budget: &Budget) -> Result<Rows, Error> {
         let periodic = self.period.iter().any(|length| length.is_finite());
-        let (search, uniform) = (self, matches!(self.limits, Limits::Uniform(_)));
-        match (periodic, uniform) {
-            (false, true) => widest(Pass::<T, D, false, true> {
-                search,
-                slots,
-                budget,
-            }),
-            (false, false) => widest(Pass::<T, D, false, false> {
-                search,
-                slots,
-                budget,
-            }),
-            (true, true) => widest(Pass::<T, D, true, true> {
-                search,
-                slots,
-                budget,
-            }),
-            (true, false) => widest(Pass::<T, D, true, false> {
-                search,
-                slots,
-                budget,
-            }),
+        match (periodic, &self.limits) {
+            (false, Limits::Uniform(_)) => self.pass::<false, true>(slots, budget),
+            (false, _) => self.pass::<false, false>(slots, budget),
+            (true, Limits::Uniform(_)) => self.pass::<true, true>(slots, budget),
+            (true, _) => self.pass::<true, false>(slots, budget),
         }
+    }
+
+    fn pass<const PERIODIC: bool, const UNIFORM: bool>(
+        &self,
+        slots: Range<usize>,
+        budget: &Budget,
+    ) -> Result<Rows, Error> {
+        widest(Pass::<T, D, PERIODIC, UNIFORM> {
+            search: self,
+            slots,
+            budget,
+        })
     }
 
     /// A function that tells which sorted particles are within the cutoff of `receiver`:
