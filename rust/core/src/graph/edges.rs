@@ -4,7 +4,7 @@ use std::mem::MaybeUninit;
 
 use super::Graph;
 use super::lanes::{BLOCK, Lanes, Work, widest};
-use super::memory::Budget;
+use super::memory::{Budget, reserve};
 use super::order::{NONE, write_sorted};
 use crate::Error;
 use crate::threads::{self, Threads};
@@ -100,10 +100,7 @@ pub(super) fn assemble(
 
     let edges = total as usize;
     budget.check(edges)?;
-    let mut edge_index: Vec<i64> = Vec::new();
-    edge_index
-        .try_reserve_exact(2 * edges)
-        .map_err(|_| no_memory_for(edges))?;
+    let mut edge_index: Vec<i64> = reserve(2 * edges).ok_or_else(|| no_memory_for(edges))?;
     let (mut senders, mut receivers) =
         edge_index.spare_capacity_mut()[..2 * edges].split_at_mut(edges);
     let mut tasks = Vec::new();

@@ -400,13 +400,28 @@ pub(super) fn bounds<T: Scalar, const D: usize>(positions: &[[T; D]]) -> ([f64; 
     let Some(&first) = positions.first() else {
         return ([0.0; D], [0.0; D]);
     };
-    let (low, high) = positions.iter().fold((first, first), |(low, high), p| {
-        (
-            std::array::from_fn(|a| low[a].lesser(p[a])),
-            std::array::from_fn(|a| high[a].greater(p[a])),
-        )
-    });
-    (low.map(T::to_f64), high.map(T::to_f64))
+    // Several bounds side by side, none of which waits for another.
+    const SIDE: usize = 4;
+    let (mut lows, mut highs) = ([first; SIDE], [first; SIDE]);
+    let mut take = |s: usize, p: &[T; D]| {
+        for a in 0..D {
+            lows[s][a] = lows[s][a].lesser(p[a]);
+            highs[s][a] = highs[s][a].greater(p[a]);
+        }
+    };
+    let (blocks, rest) = positions.as_chunks::<SIDE>();
+    for block in blocks {
+        for s in 0..SIDE {
+            take(s, &block[s]);
+        }
+    }
+    for p in rest {
+        take(0, p);
+    }
+    let fold = |side: [[T; D]; SIDE], pick: fn(T, T) -> T| {
+        std::array::from_fn(|a| side.iter().map(|p| p[a]).fold(first[a], pick).to_f64())
+    };
+    (fold(lows, T::lesser), fold(highs, T::greater))
 }
 
 /// Moves a position into the box along its periodic axes.

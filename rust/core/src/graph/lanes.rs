@@ -1,13 +1,26 @@
 //! Operations on blocks of eight numbers, in AVX2 instructions where the processor at hand
 //! has them, since the compiler does not find these by itself and must not rely on them.
 
+use super::scalar::Scalar;
+
 /// Numbers to a block.
 pub(super) const BLOCK: usize = 8;
 
 /// The instructions that [`Work`] may use.
 pub(super) trait Lanes: Copy {
-    /// For each key, how many of `others` are smaller.
-    fn count_smaller(self, keys: &[i32; BLOCK], others: &[i32]) -> [i32; BLOCK];
+    /// One bit per place, set where the value is at most its limit.
+    fn at_most<T: Scalar>(self, values: &[T; BLOCK], limits: &[T; BLOCK]) -> u8;
+
+    /// For each key, how many of `row` are smaller, without `dropped` among them. For a
+    /// key that is `dropped`, and the keys behind the first `keep`, it is `other`.
+    fn places(
+        self,
+        keys: &[i32; BLOCK],
+        keep: usize,
+        row: &[i32],
+        dropped: i32,
+        other: i32,
+    ) -> [i32; BLOCK];
 
     /// Writes those of `values` whose bit in `chosen` is set to `end`, in order, and
     /// returns how many. What is written behind them does not count.
@@ -24,8 +37,18 @@ pub(super) trait Work {
     fn run<L: Lanes>(self, lanes: L) -> Self::Output;
 }
 
+#[cfg(test)]
+thread_local! {
+    /// Whether this thread does without what its processor has.
+    pub(super) static PLAIN: std::cell::Cell<bool> = const { std::cell::Cell::new(false) };
+}
+
 /// Does `work` with the best instructions that this processor has.
 pub(super) fn widest<W: Work>(work: W) -> W::Output {
+    #[cfg(test)]
+    if PLAIN.get() {
+        return work.run(Portable);
+    }
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx2") {
         #[target_feature(enable = "avx2")]
@@ -63,8 +86,27 @@ struct Portable;
 
 impl Lanes for Portable {
     #[inline(always)]
-    fn count_smaller(self, keys: &[i32; BLOCK], others: &[i32]) -> [i32; BLOCK] {
-        keys.map(|key| others.iter().map(|&other| i32::from(key > other)).sum())
+    fn at_most<T: Scalar>(self, values: &[T; BLOCK], limits: &[T; BLOCK]) -> u8 {
+        T::at_most(values, limits)
+    }
+
+    #[inline(always)]
+    fn places(
+        self,
+        keys: &[i32; BLOCK],
+        keep: usize,
+        row: &[i32],
+        dropped: i32,
+        other: i32,
+    ) -> [i32; BLOCK] {
+        std::array::from_fn(|l| {
+            if l < keep && keys[l] != dropped {
+                let smaller: i32 = row.iter().map(|&sender| i32::from(keys[l] > sender)).sum();
+                smaller - i32::from(keys[l] > dropped)
+            } else {
+                other
+            }
+        })
     }
 
     /// As many are written as there often are, then the others if there are more.
@@ -92,12 +134,12 @@ impl Lanes for Portable {
 #[cfg(target_arch = "x86_64")]
 mod avx2 {
     use std::arch::x86_64::{
-        _mm_loadl_epi64, _mm256_cmpgt_epi32, _mm256_cvtepu8_epi32, _mm256_loadu_si256,
-        _mm256_permutevar8x32_epi32, _mm256_set1_epi32, _mm256_setzero_si256, _mm256_storeu_si256,
-        _mm256_sub_epi32,
+        _mm_loadl_epi64, _mm256_andnot_si256, _mm256_blendv_epi8, _mm256_cmpeq_epi32,
+        _mm256_cmpgt_epi32, _mm256_cvtepu8_epi32, _mm256_loadu_si256, _mm256_permutevar8x32_epi32,
+        _mm256_set1_epi32, _mm256_setr_epi32, _mm256_storeu_si256, _mm256_sub_epi32,
     };
 
-    use super::{BLOCK, Lanes, ONES};
+    use super::{BLOCK, Lanes, ONES, Scalar};
 
     /// Exists only where the processor has AVX2.
     #[derive(Clone, Copy)]
@@ -105,20 +147,40 @@ mod avx2 {
 
     impl Lanes for Avx2 {
         #[inline(always)]
-        fn count_smaller(self, keys: &[i32; BLOCK], others: &[i32]) -> [i32; BLOCK] {
-            let mut counts = [0; BLOCK];
+        fn at_most<T: Scalar>(self, values: &[T; BLOCK], limits: &[T; BLOCK]) -> u8 {
+            // SAFETY: the processor has AVX2.
+            unsafe { T::at_most_avx2(values, limits) }
+        }
+
+        #[inline(always)]
+        fn places(
+            self,
+            keys: &[i32; BLOCK],
+            keep: usize,
+            row: &[i32],
+            dropped: i32,
+            other: i32,
+        ) -> [i32; BLOCK] {
+            let mut places = [0; BLOCK];
             // SAFETY: the processor has AVX2, and the load and the store are of blocks.
             unsafe {
                 let keys = _mm256_loadu_si256(keys.as_ptr().cast());
-                let mut smaller = _mm256_setzero_si256();
-                for &other in others {
-                    // A comparison that holds is -1.
-                    let is_smaller = _mm256_cmpgt_epi32(keys, _mm256_set1_epi32(other));
+                let dropped = _mm256_set1_epi32(dropped);
+                // A comparison that holds is -1.
+                let mut smaller = _mm256_cmpgt_epi32(keys, dropped);
+                for &sender in row {
+                    let is_smaller = _mm256_cmpgt_epi32(keys, _mm256_set1_epi32(sender));
                     smaller = _mm256_sub_epi32(smaller, is_smaller);
                 }
-                _mm256_storeu_si256(counts.as_mut_ptr().cast(), smaller);
+                let lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+                let kept = _mm256_andnot_si256(
+                    _mm256_cmpeq_epi32(keys, dropped),
+                    _mm256_cmpgt_epi32(_mm256_set1_epi32(keep.min(BLOCK) as i32), lane),
+                );
+                let chosen = _mm256_blendv_epi8(_mm256_set1_epi32(other), smaller, kept);
+                _mm256_storeu_si256(places.as_mut_ptr().cast(), chosen);
             }
-            counts
+            places
         }
 
         #[inline(always)]
@@ -140,32 +202,46 @@ mod avx2 {
 mod tests {
     use super::*;
 
-    /// What each kind makes of every byte, and of keys among others.
+    const VALUES: [i32; BLOCK] = [7, -3, 12, 0, 5, 1, i32::MAX, i32::MIN];
+
+    /// What each kind makes of every byte, of limits, and of a row from whose block of
+    /// `VALUES` one is dropped.
     struct Everything;
 
     impl Work for Everything {
-        type Output = (Vec<Vec<i32>>, [i32; BLOCK]);
+        type Output = (Vec<Vec<i32>>, [u8; 2], [[i32; BLOCK]; 2]);
 
         fn run<L: Lanes>(self, lanes: L) -> Self::Output {
-            let values = [7, -3, 12, 0, 5, 1, i32::MAX, i32::MIN];
             let chosen = (0..=u8::MAX).map(|byte| {
                 let mut end = [-1; BLOCK];
                 // SAFETY: `end` is a block.
-                let n = unsafe { lanes.append(byte, &values, &mut end) };
+                let n = unsafe { lanes.append(byte, &VALUES, &mut end) };
                 end[..n].to_vec()
             });
-            (chosen.collect(), lanes.count_smaller(&values, &values[..5]))
+            let values = [0.0, 1.0, 2.0, f64::NAN, 3.0, -1.0, 1.5, f64::INFINITY];
+            let near = [
+                lanes.at_most(&values, &[1.5; BLOCK]),
+                lanes.at_most(&values.map(|v| v as f32), &[1.5; BLOCK]),
+            ];
+            let places = [
+                lanes.places(&VALUES, 8, &VALUES, 5, 7),
+                lanes.places(&VALUES, 3, &VALUES[..3], i32::MAX, 3),
+            ];
+            (chosen.collect(), near, places)
         }
     }
 
     #[test]
     fn portable_and_widest_do_what_they_say() {
-        let values = [7, -3, 12, 0, 5, 1, i32::MAX, i32::MIN];
         let chosen = (0..=u8::MAX).map(|byte| {
             let places = (0..BLOCK).filter(|place| byte >> place & 1 == 1);
-            places.map(|place| values[place]).collect()
+            places.map(|place| VALUES[place]).collect()
         });
-        let expected = (chosen.collect(), [3, 0, 4, 1, 2, 2, 5, 0]);
+        let expected = (
+            chosen.collect(),
+            [0b0110_0011; 2],
+            [[4, 1, 5, 2, 7, 3, 6, 0], [1, 0, 2, 3, 3, 3, 3, 3]],
+        );
         assert_eq!(Everything.run(Portable), expected);
         assert_eq!(widest(Everything), expected);
     }

@@ -1,4 +1,4 @@
-//! How many edges there is room for.
+//! How many edges there is room for, and that room.
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -54,4 +54,29 @@ fn available_memory() -> usize {
     let group = system.cgroup_limits().map(|limits| limits.free_memory);
     let bytes = system.available_memory().min(group.unwrap_or(u64::MAX));
     usize::try_from(bytes).unwrap_or(usize::MAX)
+}
+
+/// An empty vector with room for `count` values, `None` if there is no memory for it.
+///
+/// Fresh memory is mapped page by page as it is written to, which for a large graph takes as
+/// long as the search; the system is asked for large pages.
+pub(super) fn reserve<T>(count: usize) -> Option<Vec<T>> {
+    let mut room = Vec::<T>::new();
+    room.try_reserve_exact(count).ok()?;
+    #[cfg(target_os = "linux")]
+    {
+        const LARGE: usize = 1 << 22;
+        const PAGE: usize = 1 << 12;
+        let bytes = count * size_of::<T>();
+        if bytes >= LARGE {
+            let start = room.as_mut_ptr().cast::<libc::c_void>();
+            let skipped = start.align_offset(PAGE);
+            // SAFETY: the range lies inside the allocation, and the advice changes nothing
+            // that is in it; where it is not taken, nothing is lost.
+            unsafe {
+                libc::madvise(start.add(skipped), bytes - skipped, libc::MADV_HUGEPAGE);
+            }
+        }
+    }
+    Some(room)
 }

@@ -24,18 +24,16 @@ pub(super) fn write_sorted<L: Lanes>(
     dropped: i32,
     out: &mut [MaybeUninit<i64>],
 ) {
-    if n > RANKED {
+    let kept = n - usize::from(dropped != NONE);
+    if n > RANKED || out.len() <= kept {
         return write_sorted_long(&row[..n], dropped, out);
     }
     for start in (0..n).step_by(BLOCK) {
-        let keys: &[i32; BLOCK] = row[start..].first_chunk().expect("room");
-        let smaller = lanes.count_smaller(keys, &row[..n]);
-        for (&key, &smaller) in keys.iter().zip(&smaller).take(n - start) {
-            let place = smaller as usize - usize::from(key > dropped);
-            let place = if key == dropped { n - 1 } else { place };
-            if let Some(slot) = out.get_mut(place) {
-                slot.write(i64::from(key));
-            }
+        let keys = row[start..].first_chunk().expect("room");
+        let places = lanes.places(keys, n - start, &row[..n], dropped, kept as i32);
+        for (&key, &place) in keys.iter().zip(&places) {
+            // SAFETY: a place is at most `kept`, and there are more.
+            unsafe { out.get_unchecked_mut(place as usize) }.write(i64::from(key));
         }
     }
 }

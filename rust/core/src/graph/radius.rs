@@ -118,3 +118,37 @@ fn build<T: Scalar, const D: usize>(
         &budget,
     )
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::graph::lanes::PLAIN;
+
+    #[test]
+    fn every_processor_builds_the_same_graph() {
+        // A sequence without pattern (Weyl), its radii likewise.
+        let weyl = |n: usize| (1..=n).map(|i| (i as f64 * 0.754_877_666_246_693).fract());
+        let positions: Vec<f64> = weyl(1200).collect();
+        for (dim, period) in [(2, None), (2, Some(&[1.0, 0.0][..])), (3, None)] {
+            let particles = Particles {
+                positions: &positions,
+                dim,
+                ptr: None,
+                period,
+            };
+            let radii: Vec<f64> = weyl(1200 / dim).map(|w| 0.05 + 0.1 * w).collect();
+            for self_edges in [false, true] {
+                let options = Options {
+                    self_edges,
+                    threads: threads::Threads::AtMost(std::num::NonZeroUsize::MIN),
+                };
+                let build = |plain| {
+                    PLAIN.set(plain);
+                    [Radius::Uniform(0.1), Radius::PerParticle(&radii)]
+                        .map(|radius| radius_graph(&particles, radius, &options).expect("room"))
+                };
+                assert_eq!(build(true), build(false), "{dim} {period:?} {self_edges}");
+            }
+        }
+    }
+}

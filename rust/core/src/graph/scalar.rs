@@ -28,6 +28,8 @@ pub trait Scalar:
 {
     /// Positive infinity.
     const INFINITY: Self;
+    /// Not a number.
+    const NAN: Self;
     /// Distance from one to the next larger number.
     const EPSILON: f64;
     /// The name of the kind, for messages.
@@ -50,16 +52,23 @@ pub trait Scalar:
     /// A total order, the usual one for numbers that are not NaN.
     fn total_cmp(&self, other: &Self) -> std::cmp::Ordering;
     /// One bit per place, set where the value is at most its limit; the first place is
-    /// the lowest bit. On x86-64 it is spelt in vector instructions, which the compiler
-    /// does not find by itself.
+    /// the lowest bit.
     #[doc(hidden)]
     fn at_most(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8;
+    /// The same in vector instructions, which the compiler does not find by itself.
+    ///
+    /// # Safety
+    /// The processor has AVX2.
+    #[cfg(target_arch = "x86_64")]
+    #[doc(hidden)]
+    unsafe fn at_most_avx2(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8;
 }
 
 macro_rules! scalar {
     ($kind:ident, $name:literal, $per:literal, $load:ident, $compare:ident, $mask:ident) => {
         impl Scalar for $kind {
             const INFINITY: Self = $kind::INFINITY;
+            const NAN: Self = $kind::NAN;
             const EPSILON: f64 = $kind::EPSILON as f64;
             const NAME: &'static str = $name;
 
@@ -97,21 +106,22 @@ macro_rules! scalar {
             }
             #[inline(always)]
             fn at_most(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8 {
-                #[cfg(target_arch = "x86_64")]
-                {
-                    use std::arch::x86_64::{$compare, $load, $mask};
-                    let (values, limits) = (values.as_chunks::<$per>(), limits.as_chunks::<$per>());
-                    let chunks = values.0.iter().zip(limits.0).rev();
-                    chunks.fold(0, |bits, (values, limits)| {
-                        let (values, limits) = (values.as_ptr(), limits.as_ptr());
-                        // SAFETY: every x86-64 processor has these instructions, and the
-                        // loads read the chunks they point to.
-                        let mask = unsafe { $mask($compare($load(values), $load(limits))) };
-                        bits << $per | mask as u8
-                    })
-                }
-                #[cfg(not(target_arch = "x86_64"))]
                 (0..BLOCK).fold(0, |bits, l| bits | u8::from(values[l] <= limits[l]) << l)
+            }
+            #[cfg(target_arch = "x86_64")]
+            #[inline(always)]
+            unsafe fn at_most_avx2(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8 {
+                use std::arch::x86_64::{_CMP_LE_OQ, $compare, $load, $mask};
+                let (values, limits) = (values.as_chunks::<$per>(), limits.as_chunks::<$per>());
+                let chunks = values.0.iter().zip(limits.0).rev();
+                chunks.fold(0, |bits: u32, (values, limits)| {
+                    // SAFETY: promised by the caller, and the loads read the chunks.
+                    let near = unsafe {
+                        let (values, limits) = ($load(values.as_ptr()), $load(limits.as_ptr()));
+                        $mask($compare::<_CMP_LE_OQ>(values, limits))
+                    };
+                    bits << $per | near as u32
+                }) as u8
             }
         }
     };
@@ -120,16 +130,16 @@ macro_rules! scalar {
 scalar!(
     f32,
     "float32",
-    4,
-    _mm_loadu_ps,
-    _mm_cmple_ps,
-    _mm_movemask_ps
+    8,
+    _mm256_loadu_ps,
+    _mm256_cmp_ps,
+    _mm256_movemask_ps
 );
 scalar!(
     f64,
     "float64",
-    2,
-    _mm_loadu_pd,
-    _mm_cmple_pd,
-    _mm_movemask_pd
+    4,
+    _mm256_loadu_pd,
+    _mm256_cmp_pd,
+    _mm256_movemask_pd
 );

@@ -101,40 +101,6 @@ impl<T: Scalar, const D: usize> Search<T, D> {
             budget,
         })
     }
-
-    /// A function that tells which sorted particles are within the cutoff of `receiver`:
-    /// one bit for each of the block from a sorted particle on.
-    #[inline(always)]
-    fn near<const PERIODIC: bool, const UNIFORM: bool>(
-        &self,
-        receiver: usize,
-    ) -> impl Fn(usize) -> u8 {
-        let coords: [&[T]; D] = std::array::from_fn(|a| &self.grid.coords[a][..]);
-        let here = coords.map(|coords| coords[receiver]);
-        let period = self.period;
-        let (limit, limits) = match &self.limits {
-            &Limits::Uniform(limit) => (limit, &[][..]),
-            Limits::PerParticle(limits) => (limits[receiver], &limits[..]),
-        };
-        move |start| {
-            let mut distances = [T::default(); BLOCK];
-            for a in 0..D {
-                // SAFETY: the arrays have room for a block behind the last particle.
-                let there = unsafe { block(coords[a], start) };
-                for l in 0..BLOCK {
-                    let d = separation::<T, PERIODIC>(here[a], there[l], period[a]);
-                    distances[l] = distances[l] + d * d;
-                }
-            }
-            if UNIFORM {
-                T::at_most(&distances, &[limit; BLOCK])
-            } else {
-                // SAFETY: as above.
-                let theirs = unsafe { block(limits, start) };
-                T::at_most(&distances, &theirs.map(|theirs| theirs.greater(limit)))
-            }
-        }
-    }
 }
 
 /// The search of some of the sorted particles.
@@ -151,36 +117,117 @@ impl<T: Scalar, const D: usize, const PERIODIC: bool, const UNIFORM: bool> Work
 
     #[inline(always)]
     fn run<L: Lanes>(self, lanes: L) -> Self::Output {
-        let Grid { index, .. } = &self.search.grid;
         let mut rows = Rows::with_receivers(self.slots.len());
+        let mut candidates = Candidates::new();
         let mut cells = self.search.grid.cells(self.slots);
         while let Some(receivers) = cells.next() {
-            let most = cells.runs().iter().map(Range::len).sum();
+            candidates.gather::<UNIFORM>(self.search, cells.runs());
             for receiver in receivers {
-                let near = self.search.near::<PERIODIC, UNIFORM>(receiver);
-                let row = rows.next(most, self.budget)?.as_mut_ptr();
+                let near = candidates.near::<_, PERIODIC, UNIFORM>(lanes, self.search, receiver);
+                let row = rows.next(candidates.count, self.budget)?.as_mut_ptr();
                 let mut n = 0;
-                for run in cells.runs() {
-                    let mut start = run.start;
-                    while start < run.end {
-                        let beyond = BLOCK - BLOCK.min(run.end - start);
-                        // SAFETY: `start` is a sorted particle, behind the last of which
-                        // the arrays have room for a block, and so has the row behind
-                        // `most` senders.
-                        n += unsafe {
-                            lanes.append(
-                                near(start) & (u8::MAX >> beyond),
-                                block(index, start),
-                                row.add(n).cast(),
-                            )
-                        };
-                        start += BLOCK;
-                    }
+                for start in (0..candidates.count).step_by(BLOCK) {
+                    // SAFETY: a block of candidates begins at `start`, and the row has
+                    // room for a block behind all of them.
+                    n += unsafe {
+                        let senders = block(&candidates.index, start);
+                        lanes.append(near(start), senders, row.add(n).cast())
+                    };
                 }
                 rows.finish(n);
             }
         }
         Ok(rows)
+    }
+}
+
+/// The particles around a cell, packed, so that every particle of the cell goes through the
+/// same whole blocks.
+struct Candidates<T, const D: usize> {
+    count: usize,
+    /// Room for a block behind the candidates; there x is NaN, which is near to nothing.
+    coords: [Vec<T>; D],
+    /// Squared cutoffs, where each particle has its own.
+    limits: Vec<T>,
+    /// The caller's indices.
+    index: Vec<i32>,
+}
+
+impl<T: Scalar, const D: usize> Candidates<T, D> {
+    fn new() -> Self {
+        Self {
+            count: 0,
+            coords: std::array::from_fn(|_| Vec::new()),
+            limits: Vec::new(),
+            index: Vec::new(),
+        }
+    }
+
+    /// Holds the sorted particles `runs` instead.
+    #[inline(always)]
+    fn gather<const UNIFORM: bool>(&mut self, search: &Search<T, D>, runs: &[Range<usize>]) {
+        self.count = runs.iter().map(Range::len).sum();
+        let room = self.count + BLOCK;
+        if self.index.len() < room {
+            for coords in &mut self.coords {
+                coords.resize(2 * room, T::default());
+            }
+            self.limits.resize(2 * room, T::default());
+            self.index.resize(2 * room, 0);
+        }
+        let mut end = 0;
+        for run in runs {
+            for (from, to) in run.clone().step_by(BLOCK).zip((end..).step_by(BLOCK)) {
+                // SAFETY: there is room for a block behind the sorted particles and behind
+                // the candidates.
+                unsafe {
+                    for (coords, sorted) in self.coords.iter_mut().zip(&search.grid.coords) {
+                        copy_block(sorted, from, coords, to);
+                    }
+                    copy_block(&search.grid.index, from, &mut self.index, to);
+                    if let (false, Limits::PerParticle(limits)) = (UNIFORM, &search.limits) {
+                        copy_block(limits, from, &mut self.limits, to);
+                    }
+                }
+            }
+            end += run.len();
+        }
+        self.coords[0][end..room].fill(T::NAN);
+    }
+
+    /// A function that tells which candidates are within the cutoff of the sorted particle
+    /// `receiver`: one bit for each of the block from a candidate on.
+    #[inline(always)]
+    fn near<L: Lanes, const PERIODIC: bool, const UNIFORM: bool>(
+        &self,
+        lanes: L,
+        search: &Search<T, D>,
+        receiver: usize,
+    ) -> impl Fn(usize) -> u8 {
+        let here: [T; D] = std::array::from_fn(|a| search.grid.coords[a][receiver]);
+        let period = search.period;
+        let limit = match &search.limits {
+            &Limits::Uniform(limit) => limit,
+            Limits::PerParticle(limits) => limits[receiver],
+        };
+        move |start| {
+            let mut distances = [T::default(); BLOCK];
+            for a in 0..D {
+                // SAFETY: `start` is a candidate.
+                let there = unsafe { block(&self.coords[a], start) };
+                for l in 0..BLOCK {
+                    let d = separation::<T, PERIODIC>(here[a], there[l], period[a]);
+                    distances[l] = distances[l] + d * d;
+                }
+            }
+            if UNIFORM {
+                lanes.at_most(&distances, &[limit; BLOCK])
+            } else {
+                // SAFETY: as above.
+                let theirs = unsafe { block(&self.limits, start) };
+                lanes.at_most(&distances, &theirs.map(|theirs| theirs.greater(limit)))
+            }
+        }
     }
 }
 
@@ -207,4 +254,20 @@ unsafe fn block<T>(values: &[T], start: usize) -> &[T; BLOCK] {
     debug_assert!(start + BLOCK <= values.len());
     // SAFETY: promised by the caller.
     unsafe { &*values.as_ptr().add(start).cast() }
+}
+
+/// Copies the block of `from` at `start` to that of `to` at `end`.
+///
+/// # Safety
+/// There are such blocks.
+#[inline(always)]
+unsafe fn copy_block<T: Copy>(from: &[T], start: usize, to: &mut [T], end: usize) {
+    debug_assert!(end + BLOCK <= to.len());
+    // SAFETY: promised by the caller.
+    unsafe {
+        to.as_mut_ptr()
+            .add(end)
+            .cast::<[T; BLOCK]>()
+            .write_unaligned(*block(from, start))
+    };
 }
