@@ -173,7 +173,7 @@ class TrainConfig:
     """Share of the last position's noise that the target undoes in one frame; 0: none, as GNS."""
     compression: float = 0.0
     """Scale of the strain of smooth random compressions, to which the target adds the acceleration
-    that undoes them; 0: none, as GNS."""
+    that undoes them; none in samples with kinematic particles. 0: none at all, as GNS."""
     mirror: bool = False
     """Reflect every other sample along the first axis (for physics that is symmetric there)."""
     seed: int = 0

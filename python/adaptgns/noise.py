@@ -59,8 +59,8 @@ def compression(
     Random-walk noise is new for every particle, and says nothing of errors that neighbours share:
     a model that brakes a falling block too late piles it up, all of it, and solver data hold no
     piles to learn from. The compression is the gradient of a few standing waves, of 4 ``radius``
-    to twice the extent of ``bounds`` ``[d, 2]`` in length, that move nothing across a wall. The
-    acceleration is that of a fluid in which sound crosses half a ``radius`` per frame, bounded
+    to twice the extent of ``bounds`` ``[d, 2]`` in length, that move nothing across a wall; along
+    periodic axes they begin anywhere. The acceleration is that of a fluid in which sound crosses half a ``radius`` per frame, bounded
     where the waves are short.
 
     Args:
@@ -79,16 +79,19 @@ def compression(
         most = np.maximum(extent / (2 * radius), 1)
         halves = np.floor(most ** rng.random(len(extent))) * (rng.random(len(extent)) < 0.8)
         halves = np.where(periodic, 2 * np.ceil(halves / 2), halves)
+        shift = np.where(periodic, rng.uniform(0, 2 * np.pi, len(extent)), 0)
         sign = rng.choice([-1, 1])
         wave = np.pi * halves / extent
         square = (wave**2).sum()
         if square == 0:
             continue
-        cosines = np.cos(phase * halves)
+        cosines = np.cos(phase * halves + shift)
         gradient = np.empty(positions.shape)
         for axis in range(len(extent)):
             others = np.delete(cosines, axis, axis=1).prod(axis=1)
-            gradient[:, axis] = -wave[axis] * np.sin(phase[:, axis] * halves[axis]) * others
+            gradient[:, axis] = (
+                -wave[axis] * np.sin(phase[:, axis] * halves[axis] + shift[axis]) * others
+            )
         part = sign * amplitude / square * gradient
         displacement += part
         stiffness = (radius / 2) ** 2 * square

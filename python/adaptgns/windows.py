@@ -96,6 +96,7 @@ class Windows(Dataset[Sample]):
         self.metadata = metadata
         self.config = config
         self.noise = noise
+        self.radius = metadata.radius if config.model.radius is None else config.model.radius
         self.frames = HISTORY + 1 + (config.graph == "adaptive")
         counts = np.maximum(trajectories.lengths - self.frames + 1, 0)
         self.starts = np.concatenate([[0], np.cumsum(counts)])
@@ -138,17 +139,18 @@ class Windows(Dataset[Sample]):
         if config.drift > 0:
             drift = drift_noise(rng, len(positions) - 1, dim, config.drift)
             positions[:-1] += drift[:, None] * mobile[:, None]
-        if config.compression > 0:
+        # Where solid bodies move or stand, the fluid around them cannot go just anywhere.
+        if config.compression > 0 and mobile.all():
             displacement, acceleration = compression(
                 rng,
                 inputs[-1],
                 np.array(self.metadata.bounds),
                 self.metadata.periodic,
                 strain=config.compression,
-                radius=self.metadata.radius,
+                radius=self.radius,
             )
-            positions += displacement * mobile[:, None]
-            following += acceleration * mobile[:, None]
+            positions += displacement
+            following += acceleration
 
     def collate(self, samples: Sequence[Sample]) -> Batch:
         """One batch with its base graph, built on the noisy positions."""
@@ -161,7 +163,7 @@ class Windows(Dataset[Sample]):
         if model.edges:
             edges = radius_graph(
                 frames[-3] if self.config.graph == "adaptive" else frames[-2],
-                model.radius if model.radius is not None else self.metadata.radius,
+                self.radius,
                 ptr=ptr,
                 box=self.metadata.box,
                 self_edges=model.self_edges,

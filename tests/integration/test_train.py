@@ -80,10 +80,15 @@ def test_a_run_is_resumed_with_what_its_weights_are_made_for(
           "--mirror"])  # fmt: skip
     assert "assuming physics that is symmetric" in capsys.readouterr().out
     saved = (tmp_path / "config.json").read_bytes()
-    with pytest.raises(SystemExit) as exit_:
-        main(["--resume", str(tmp_path), "--loss", "mse"])
-    assert exit_.value.code == 2
-    assert "loss: the run was started with nll; got mse" in capsys.readouterr().err
+    for option, value, told in (
+        ("--loss", "mse", "loss: the run was started with nll; got mse"),
+        ("--noise", "0.1", "noise: the run was started with 0.00067; got 0.1"),
+        ("--model.latent", "8", "latent: the run was started with 16; got 8"),
+    ):
+        with pytest.raises(SystemExit) as exit_:
+            main(["--resume", str(tmp_path), option, value])
+        assert exit_.value.code == 2
+        assert told in capsys.readouterr().err
     assert (tmp_path / "config.json").read_bytes() == saved
 
 

@@ -21,7 +21,15 @@ from adaptgns.checkpoint import (
     with_prefix,
     write_checkpoint,
 )
-from adaptgns.config import ConfigError, TrainConfig, from_json, to_json
+from adaptgns.config import (
+    AdaptiveConfig,
+    ConfigError,
+    ModelConfig,
+    RolloutConfig,
+    TrainConfig,
+    from_json,
+    to_json,
+)
 from adaptgns.data.metadata import Metadata
 
 
@@ -95,9 +103,22 @@ def test_unknown_keys_and_wrong_kinds_are_refused(small_config: TrainConfig) -> 
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("steps", 0), ("lr", math.nan), ("noise", math.inf), ("position_correction", 1.5)],
+    ("config", "name", "value"),
+    [
+        (TrainConfig(), "steps", 0),
+        (TrainConfig(), "lr", math.nan),
+        (TrainConfig(), "noise", math.inf),
+        (TrainConfig(), "position_correction", 1.5),
+        (ModelConfig(), "latent", 0),
+        (ModelConfig(), "radius", -0.1),
+        (AdaptiveConfig(), "tau", 200),
+        (AdaptiveConfig(), "factor", 0.9),
+        (RolloutConfig(Path("run"), Path("out.h5")), "k", 0),
+        (RolloutConfig(Path("run"), Path("out.h5")), "one_step_every", 0),
+    ],
 )
-def test_values_outside_their_range_are_refused(name: str, value: float) -> None:
+def test_values_outside_their_range_are_refused(
+    config: TrainConfig | ModelConfig | AdaptiveConfig | RolloutConfig, name: str, value: float
+) -> None:
     with pytest.raises(ValueError, match=f"{name}: got {value}; accepted are"):
-        replace(TrainConfig(), **{name: value})
+        replace(config, **{name: value})

@@ -68,3 +68,9 @@ def test_compression_is_the_same_at_both_ends_of_a_period() -> None:
     for seed in range(10):
         displacement, _ = compress(seed, periodic=(True, False))
         np.testing.assert_allclose(displacement[low], displacement[high], atol=1e-6)
+
+
+def test_compression_along_a_period_begins_anywhere() -> None:
+    """No place of a periodic box stands still in all of them, as a wall would."""
+    displacements = [compress(seed, periodic=(True, True))[0] for seed in range(40)]
+    assert np.abs(displacements).max(axis=(0, 2)).min() > 1e-4

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from adaptgns._core import radius_graph
 from adaptgns.segment import Graph, at_receivers, at_senders, sum_at_receivers
 
 
@@ -36,3 +37,15 @@ def test_forward_and_gradient_equal_index_operations(seed: int, nodes: int, edge
     (ours * weights).sum().backward()
     (theirs * weights).sum().backward()
     torch.testing.assert_close(x.grad, y.grad)
+
+
+def test_a_graph_for_inference_gathers_and_sums_alike() -> None:
+    rng = np.random.default_rng(0)
+    edges, offsets = radius_graph(rng.random((50, 2)), 0.2, self_edges=True, return_offsets=True)
+    x = torch.from_numpy(rng.standard_normal((50, 3)))
+    results = []
+    for graph in (Graph.from_numpy(edges, offsets), Graph.for_inference(edges, offsets)):
+        per_edge = at_senders(x, graph) * at_receivers(x, graph).sin()
+        results.append(sum_at_receivers(per_edge, graph))
+        assert len(per_edge) == edges.shape[1]
+    assert torch.equal(*results)

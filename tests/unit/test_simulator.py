@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from adaptgns import _core
 from adaptgns.config import ModelConfig
 from adaptgns.data.metadata import Metadata
 from adaptgns.segment import Graph
@@ -176,3 +177,26 @@ def test_periodic_axes_use_the_nearest_image(metadata: Metadata) -> None:
     )
     advanced = simulator.advance(moved, torch.zeros(10, 2))
     assert ((advanced[:, 0] >= 0) & (advanced[:, 0] < 1)).all()
+
+
+def test_relative_motion_across_a_period(metadata: Metadata) -> None:
+    periodic = replace(metadata, bounds=((0.0, 1.0), (0.1, 0.9)), periodic=(True, False))
+    torch.manual_seed(0)
+    config = replace(SMALL, relative_motion=True)
+    simulator = Simulator(config, periodic, noise=3e-4, variance=True)
+    window = random_windows(np.random.default_rng(7), 40)
+    moved = window.clone()
+    moved[..., 0] = (moved[..., 0] + 0.65) % 1.0  # across the boundary
+    assert (moved[..., 0].diff(dim=1).abs() > 0.5).any()
+    box = np.array([1.0, np.inf])
+    graph = graph_of(window[:, -1].numpy(), 0.015)
+    edges, offsets = _core.radius_graph(
+        moved[:, -1].numpy(), 0.015, box=box, self_edges=True, return_offsets=True
+    )
+    assert np.array_equal(edges, torch.stack([graph.senders, graph.receivers]).numpy())
+    torch.testing.assert_close(
+        simulator.edge_features(moved, Graph.from_numpy(edges, offsets)),
+        simulator.edge_features(window, graph),
+        rtol=0,
+        atol=1e-3,
+    )
