@@ -3,8 +3,8 @@
     python benchmarks/laptop.py DATA [--out benchmarks/results/laptop_NAME.json] [-- OPTIONS]
 
 DATA is what ``python -m adaptgns.train --data`` takes, and OPTIONS are passed on to it. Runs lie in
-``runs/benchmark``; one that was interrupted goes on, and one that has ended is not repeated, with
-other options neither, until its folder is removed.
+``runs/benchmark``; one that was interrupted goes on, and one that has ended is not repeated. One
+that was made with other options is told, and its folder is to be removed first.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
 from adaptgns import train
-from adaptgns.checkpoint import LAST
+from adaptgns.checkpoint import LAST, read_checkpoint
 from adaptgns.evaluate import METRICS, evaluate
 
 
@@ -27,9 +28,14 @@ def six_digits(number: str) -> float:
 
 def rollouts(folder: Path, arguments: list[str]) -> list[Path]:
     """The rollouts of the run in ``folder``, which is made where it is not there."""
+    begun = (folder / LAST).exists()
+    asked = [*arguments, "--out", str(folder)]
+    if begun:
+        made = replace(read_checkpoint(folder / LAST).config, resume=None)
+        if made != train.parse(asked):
+            raise SystemExit(f"{folder}: a run with other options is there; remove it first")
     if not (folder / METRICS).exists():
-        begun = (folder / LAST).exists()
-        train.main(["--resume", str(folder)] if begun else [*arguments, "--out", str(folder)])
+        train.main(["--resume", str(folder)] if begun else asked)
     return sorted((folder / "rollouts").glob("*.h5"), reverse=True)
 
 
