@@ -169,11 +169,16 @@ class TrainConfig:
     drift: float = 0.0
     """Scale of the noise on the accelerations before the last velocity that all particles of a
     sample share (length per frame squared); 0: none, as GNS."""
+    velocity_correction: float = 1.0
+    """Share of the last velocity's noise that the target undoes in one frame; 1: all, as GNS."""
     position_correction: float = 0.0
     """Share of the last position's noise that the target undoes in one frame; 0: none, as GNS."""
     compression: float = 0.0
     """Scale of the strain of smooth random compressions, to which the target adds the acceleration
     that undoes them; none in samples with kinematic particles. 0: none at all, as GNS."""
+    unroll: int = 1
+    """Frames that each sample predicts one after the other, with gradients through all of them, in
+    the second half of the training; 1: never more than one, as GNS."""
     mirror: bool = False
     """Reflect every other sample along the first axis (for physics that is symmetric there)."""
     seed: int = 0
@@ -209,8 +214,10 @@ class TrainConfig:
             clip=POSITIVE,
             noise=NOT_NEGATIVE,
             drift=NOT_NEGATIVE,
+            velocity_correction=SHARE,
             position_correction=SHARE,
             compression=SHARE,
+            unroll=COUNT,
             seed=NOT_NEGATIVE,
             workers=NOT_NEGATIVE,
             threads=COUNT,

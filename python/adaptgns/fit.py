@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -31,9 +32,10 @@ from adaptgns.checkpoint import (
 from adaptgns.config import TrainConfig, torch_device
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
-from adaptgns.graph import adaptive_graph
+from adaptgns.graph import adaptive_graph, radius_graph
 from adaptgns.interruption import interruption
 from adaptgns.losses import training_loss
+from adaptgns.network import Prediction
 from adaptgns.rollout import to_sigma
 from adaptgns.segment import Graph
 from adaptgns.validation import validate
@@ -180,10 +182,22 @@ class Trainer:
         """One optimizer step on ``batch``; the loss before it."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate()
-        graph = self._lagged_graph(batch) if self.config.graph == "adaptive" else batch.graph
-        prediction = self.simulator(batch.window, batch.particle_type, graph, batch.material)
-        target = self.simulator.target(batch.window, batch.following)
-        loss = training_loss(self.config.loss, prediction, target, batch.mobile)
+        window, graph, variance = batch.window, self._first_graph(batch), None
+        unrolled = batch.following if 2 * self.step >= self.config.steps else batch.following[:, :1]
+        losses: list[Tensor] = []
+        for following in unrolled.unbind(1):
+            prediction = self.simulator(window, batch.particle_type, graph, batch.material)
+            target = self.simulator.target(window, following)
+            losses.append(
+                training_loss(self.config.loss, prediction, target, batch.mobile, variance=variance)
+            )
+            if len(losses) < unrolled.shape[1]:
+                variance = prediction.variance if variance is None else variance
+                position = self.simulator.advance(window, prediction.acceleration)
+                position = torch.where(batch.mobile[:, None], position, following)
+                window = torch.cat([window[:, 1:], position[:, None]], dim=1)
+                graph = self._graph(batch, window, prediction)
+        loss = torch.stack(losses).mean()
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if self.config.clip is not None:
@@ -204,23 +218,41 @@ class Trainer:
             decayed = 0.5 * (1 + math.cos(math.pi * progress))
         return c.lr_final + (c.lr - c.lr_final) * decayed
 
-    def _lagged_graph(self, batch: Batch) -> Graph:
-        """The adaptive graph that a rollout would have here: its sigma comes from a pass without
-        gradient over the window one frame earlier, on that window's base graph."""
+    def _first_graph(self, batch: Batch) -> Graph | None:
+        """The graph of the batch's window. The adaptive one that a rollout would have there takes
+        its sigma from a pass without gradient over the window one frame earlier, on that window's
+        base graph."""
+        if self.config.graph == "base":
+            return batch.graph
         with torch.no_grad():
             earlier = self.simulator(
                 batch.earlier_window, batch.particle_type, batch.graph, batch.material
             )
-        edges = adaptive_graph(
-            batch.window[:, -1].cpu().numpy(),
-            to_sigma(earlier),
-            self.simulator.radius,
-            self.config.adaptive.tau,
-            self.config.adaptive.factor,
+        return self._graph(batch, batch.window, earlier)
+
+    def _graph(self, batch: Batch, window: Tensor, earlier: Prediction) -> Graph | None:
+        """The graph of ``window`` after the prediction one frame ``earlier``."""
+        if not self.config.model.edges:
+            return None
+        positions, radius = window[:, -1].detach().cpu().numpy(), self.simulator.radius
+        adaptive, mobile = self.config.adaptive, batch.mobile.cpu().numpy()
+        build = (
+            partial(radius_graph, positions, radius)
+            if self.config.graph == "base"
+            else partial(
+                adaptive_graph,
+                positions,
+                to_sigma(earlier),
+                radius,
+                adaptive.tau,
+                adaptive.factor,
+                eligible=mobile,
+            )
+        )
+        edges = build(
             ptr=batch.ptr.cpu().numpy(),
             box=self.metadata.box,
             self_edges=self.config.model.self_edges,
-            eligible=batch.mobile.cpu().numpy(),
             return_offsets=True,
         )
         return Graph.from_numpy(*edges).to(self.device)

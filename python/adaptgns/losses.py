@@ -10,7 +10,14 @@ from adaptgns.network import Prediction
 BETA = 0.5
 
 
-def training_loss(kind: Loss, prediction: Prediction, target: Tensor, mobile: Tensor) -> Tensor:
+def training_loss(
+    kind: Loss,
+    prediction: Prediction,
+    target: Tensor,
+    mobile: Tensor,
+    *,
+    variance: Tensor | None = None,
+) -> Tensor:
     """The loss ``kind`` of normalized ``target`` accelerations ``[N, d]``; a scalar.
 
     ``mobile`` ``[N]`` marks the non-kinematic particles; the others count nothing. NaN surfaces.
@@ -20,6 +27,10 @@ def training_loss(kind: Loss, prediction: Prediction, target: Tensor, mobile: Te
       log-likelihood up to a constant, with one variance s^2 per particle (Nix & Weigend 1994).
     - ``beta-nll``: the same, each particle's term weighted by s^(2 BETA) without gradient, so that
       particles with a large variance are not given up (Seitzer et al. 2022).
+
+    With ``variance`` ``[N]`` the errors are weighed by it, without gradient, instead of by that of
+    the ``prediction``, which learns nothing: in an unrolled step the error of the positions has
+    grown past that of one step, which the variance stands for.
     """
     squared_error = (prediction.acceleration - target).square().sum(1)[mobile]  # [M]
     dim = target.shape[1]
@@ -27,8 +38,10 @@ def training_loss(kind: Loss, prediction: Prediction, target: Tensor, mobile: Te
         return squared_error.mean() / dim
     if prediction.variance is None:
         raise ValueError(f"loss: {kind} needs a network with a variance head; this one has none")
-    variance = prediction.variance[mobile]
-    likelihood = squared_error / (2 * variance) + dim / 2 * variance.log()
+    weight = (prediction.variance if variance is None else variance.detach())[mobile]
+    likelihood = squared_error / (2 * weight)
+    if variance is None:
+        likelihood = likelihood + dim / 2 * weight.log()
     if kind == "beta-nll":
-        likelihood = likelihood * variance.detach() ** BETA
+        likelihood = likelihood * weight.detach() ** BETA
     return likelihood.mean()

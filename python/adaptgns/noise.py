@@ -60,8 +60,8 @@ def compression(
     a model that brakes a falling block too late piles it up, all of it, and solver data hold no
     piles to learn from. The compression is the gradient of a few standing waves, of 4 ``radius``
     to twice the extent of ``bounds`` ``[d, 2]`` in length, that move nothing across a wall; along
-    periodic axes they begin anywhere. The acceleration is that of a fluid in which sound crosses half a ``radius`` per frame, bounded
-    where the waves are short.
+    periodic axes they begin anywhere. The acceleration is that of a fluid in which sound crosses
+    half a ``radius`` per frame, bounded where the waves are short.
 
     Args:
         strain: scale of the relative change of density, drawn anew (half-normal) at each call.

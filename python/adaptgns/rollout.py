@@ -146,7 +146,7 @@ def steps(
 def to_sigma(prediction: Prediction) -> NDArray[np.float32]:
     """``[N]`` standard deviations in normalized units, of a model with a variance head."""
     assert prediction.variance is not None
-    sigma: NDArray[np.float32] = prediction.variance.sqrt().cpu().numpy()
+    sigma: NDArray[np.float32] = prediction.variance.detach().sqrt().cpu().numpy()
     return sigma
 
 

@@ -34,7 +34,7 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
       whose particles collapse into a pile, where every step costs the square of their number, is
       stopped, and its error is infinite from there.
     """
-    plain = replace(config, graph="base", mirror=False, drift=0.0, compression=0.0)
+    plain = replace(config, graph="base", unroll=1, mirror=False, drift=0.0, compression=0.0)
     windows = Windows(valid, simulator.metadata, plain, noise=0.0)
     numbers = np.linspace(0, len(windows) - 1, min(ONE_STEP_WINDOWS, len(windows)), dtype=int)
     losses, errors = [], []
@@ -42,7 +42,7 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
         batch = windows.collate([windows[0, int(number)]]).to(simulator.lower.device)
         with torch.inference_mode():
             prediction = simulator(batch.window, batch.particle_type, batch.graph, batch.material)
-            target = simulator.target(batch.window, batch.following)
+            target = simulator.target(batch.window, batch.following[:, 0])
             losses.append(float(training_loss(config.loss, prediction, target, batch.mobile)))
             errors.append(float(training_loss("mse", prediction, target, batch.mobile)))
 

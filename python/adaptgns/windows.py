@@ -1,8 +1,8 @@
 """Training samples: windows of a trajectory, noised, batched, with their graph.
 
-A window is H input positions and the position that follows them. Everything random in a sample
-(order, noise, reflection) follows from the seed, the epoch and the sample's number, so a run
-depends neither on the number of loading workers nor on where it was interrupted.
+A window is H input positions and the K positions that follow them, K = ``unroll``. Everything
+random in a sample (order, noise, reflection) follows from the seed, the epoch and the sample's
+number, so a run depends neither on the number of loading workers nor on where it was interrupted.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ Key = tuple[int, int]
 
 @dataclass(frozen=True)
 class Sample:
-    """One window. ``positions`` float32 ``[F, N, d]``: noisy inputs, then the following position;
-    F is H + 1, or H + 2 with the extra frame in front that a lagged variance needs."""
+    """One window. ``positions`` float32 ``[F, N, d]``: noisy inputs, then the following positions;
+    F is H + K, or H + K + 1 with the extra frame in front that a lagged variance needs."""
 
     positions: NDArray[np.float32]
     particle_type: NDArray[np.int64]
@@ -46,6 +46,8 @@ class Batch:
 
     frames: Tensor
     """float32 ``[N, F, d]``, the samples' positions"""
+    ahead: int
+    """K, the number of positions that follow the inputs"""
     particle_type: Tensor
     """int64 ``[N]``"""
     material: Tensor | None
@@ -61,17 +63,17 @@ class Batch:
     @property
     def window(self) -> Tensor:
         """The H input positions ``[N, H, d]``."""
-        return self.frames[:, -HISTORY - 1 : -1]
+        return self.frames[:, -HISTORY - self.ahead : -self.ahead]
 
     @property
     def earlier_window(self) -> Tensor:
         """The window one frame before, ``[N, H, d]``."""
-        return self.frames[:, -HISTORY - 2 : -2]
+        return self.frames[:, -HISTORY - self.ahead - 1 : -self.ahead - 1]
 
     @property
     def following(self) -> Tensor:
-        """The positions ``[N, d]`` to be predicted."""
-        return self.frames[:, -1]
+        """The positions ``[N, K, d]`` to be predicted."""
+        return self.frames[:, -self.ahead :]
 
     def to(self, device: torch.device) -> Batch:
         """The same batch on another device."""
@@ -82,7 +84,9 @@ class Batch:
         return self._with(lambda part: part.pin_memory())
 
     def _with(self, change: Callable[[Any], Any]) -> Batch:
-        parts = {name: part for name, part in vars(self).items() if part is not None}
+        parts = {
+            name: part for name, part in vars(self).items() if isinstance(part, Tensor | Graph)
+        }
         return replace(self, **{name: change(part) for name, part in parts.items()})
 
 
@@ -97,7 +101,7 @@ class Windows(Dataset[Sample]):
         self.config = config
         self.noise = noise
         self.radius = metadata.radius if config.model.radius is None else config.model.radius
-        self.frames = HISTORY + 1 + (config.graph == "adaptive")
+        self.frames = HISTORY + config.unroll + (config.graph == "adaptive")
         counts = np.maximum(trajectories.lengths - self.frames + 1, 0)
         self.starts = np.concatenate([[0], np.cumsum(counts)])
         self.particles = np.repeat(trajectories.particle_counts, counts)
@@ -124,21 +128,27 @@ class Windows(Dataset[Sample]):
         positions: NDArray[np.float32],
         mobile: NDArray[np.bool_],
     ) -> None:
-        """Add noise to the inputs among ``positions`` ``[F, N, d]``, and to the position that
-        follows what the target is to answer it with."""
+        """Add noise to the inputs among ``positions`` ``[F, N, d]``, and to the positions that
+        follow what the targets are to answer it with."""
         config = self.config
-        inputs, following = positions[-HISTORY - 1 : -1], positions[-1]
+        first = len(positions) - config.unroll  # that follows
+        inputs, following = positions[first - HISTORY : first], positions[first:]
         _, particles, dim = positions.shape
         if self.noise > 0:
             walk = random_walk_noise(rng, HISTORY, particles, dim, self.noise)
             walk *= mobile[:, None]
             inputs += walk
-            # The following position moves along, so that the target undoes the noise of the last
-            # velocity and of that of the last position only the share asked for.
-            following += walk[-1] * np.float32(1 - config.position_correction)
+            # What follows moves along, so that each target undoes no more of the noise of the
+            # velocity and the position before it than the shares asked for.
+            offset, velocity = walk[-1], walk[-1] - walk[-2]
+            for frame in range(config.unroll):
+                velocity = np.float32(1 - config.velocity_correction) * velocity
+                velocity -= np.float32(config.position_correction) * offset
+                offset = offset + velocity
+                following[frame] += offset
         if config.drift > 0:
-            drift = drift_noise(rng, len(positions) - 1, dim, config.drift)
-            positions[:-1] += drift[:, None] * mobile[:, None]
+            drift = drift_noise(rng, first, dim, config.drift)
+            positions[:first] += drift[:, None] * mobile[:, None]
         # Where solid bodies move or stand, the fluid around them cannot go just anywhere.
         if config.compression > 0 and mobile.all():
             displacement, acceleration = compression(
@@ -150,7 +160,8 @@ class Windows(Dataset[Sample]):
                 radius=self.radius,
             )
             positions += displacement
-            following += acceleration
+            for frame in range(config.unroll):
+                following[frame] += acceleration * np.float32((frame + 1) * (frame + 2) / 2)
 
     def collate(self, samples: Sequence[Sample]) -> Batch:
         """One batch with its base graph, built on the noisy positions."""
@@ -162,7 +173,7 @@ class Windows(Dataset[Sample]):
         graph = None
         if model.edges:
             edges = radius_graph(
-                frames[-3] if self.config.graph == "adaptive" else frames[-2],
+                frames[HISTORY - 1],  # the last input, or the one before where one is in front
                 self.radius,
                 ptr=ptr,
                 box=self.metadata.box,
@@ -172,6 +183,7 @@ class Windows(Dataset[Sample]):
             graph = Graph.from_numpy(*edges)
         return Batch(
             frames=torch.from_numpy(np.ascontiguousarray(frames.transpose(1, 0, 2))),
+            ahead=self.config.unroll,
             particle_type=torch.from_numpy(particle_type),
             material=torch.from_numpy(np.concatenate(materials)) if materials else None,
             mobile=torch.from_numpy(self.metadata.mobile(particle_type)),

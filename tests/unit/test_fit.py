@@ -8,6 +8,7 @@ import os
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -20,8 +21,10 @@ from adaptgns.config import AdaptiveConfig, TrainConfig
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.fit import Trainer, TrainingStopped
-from adaptgns.policies import Adaptive
+from adaptgns.policies import Adaptive, Fixed
 from adaptgns.rollout import steps
+from adaptgns.segment import Graph
+from tests.conftest import graph_of
 
 QUIET = Console(quiet=True)
 
@@ -58,7 +61,7 @@ def test_one_batch_can_be_overfitted(
 def test_resumed_equals_uninterrupted(
     drops: Path, tmp_path: Path, small_config: TrainConfig
 ) -> None:
-    config = replace(small_config, clip=1.0, mirror=True, warmup=3)
+    config = replace(small_config, clip=1.0, mirror=True, warmup=3, unroll=2)
     trainer(drops, tmp_path / "whole", config).run(QUIET)
 
     run = trainer(drops, tmp_path / "parts", config)
@@ -100,9 +103,9 @@ def test_a_loss_that_is_not_finite_stops_with_what_to_look_at(
     run = trainer(drops, tmp_path, small_config)
     original, calls = fit.training_loss, []
 
-    def sometimes_nan(*args: object) -> torch.Tensor:
+    def sometimes_nan(*args: object, **options: object) -> torch.Tensor:
         calls.append(None)
-        return original(*args) * (torch.nan if len(calls) == 10 else 1)
+        return original(*args, **options) * (torch.nan if len(calls) == 10 else 1)
 
     monkeypatch.setattr(fit, "training_loss", sometimes_nan)
     with pytest.raises(TrainingStopped, match=r"loss became nan.*last good state.*--lr.*--clip"):
@@ -196,6 +199,42 @@ def test_the_lagged_training_graph_is_that_of_a_rollout(
     run = trainer(drops, tmp_path, config)
     trajectory = open_split(drops, "train")[0]
     rolled = list(steps(run.simulator.eval(), trajectory, Adaptive(rule), 2, teacher_forcing=True))
-    graph = run._lagged_graph(run.windows.collate([run.windows[0, 0]]))
+    graph = run._first_graph(run.windows.collate([run.windows[0, 0]]))
+    assert graph is not None
     assert len(graph.senders) - len(trajectory.particle_type) == rolled[1].edges
     assert rolled[1].edges != rolled[0].edges
+
+
+@pytest.mark.parametrize("graph", ["base", "adaptive"])
+def test_unrolled_windows_are_those_of_a_rollout(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, graph: Literal["base", "adaptive"]
+) -> None:
+    rule = AdaptiveConfig(tau=60, factor=1.5)
+    lead = int(graph == "adaptive")
+    config = replace(small_config, graph=graph, noise=0.0, adaptive=rule, unroll=3)
+    run = trainer(drops, tmp_path, config)
+    batch = run.windows.collate([run.windows[0, 0]])
+    seen: list[tuple[torch.Tensor, int]] = []
+
+    def record(_: object, arguments: tuple[torch.Tensor, object, Graph, object]) -> None:
+        seen.append((arguments[0].detach()[:, -1], len(arguments[2].senders)))
+
+    trajectory = open_split(drops, "train")[0]
+    true = replace(trajectory, positions=trajectory.positions[lead:])
+    policy = Adaptive(rule) if lead else Fixed()
+    rolled = list(steps(run.simulator, true, policy, 3))
+    run.simulator.register_forward_pre_hook(record)
+    run.train_step(batch)
+    assert len(seen) == 1 + lead  # single steps in the first half
+
+    seen.clear()
+    run = trainer(drops, tmp_path, config)
+    run.simulator.register_forward_pre_hook(record)
+    run.step = config.steps // 2
+    run.train_step(batch)
+    assert len(seen) == 3 + lead
+    for (position, edges), step in zip(seen[1 + lead :], rolled, strict=False):
+        np.testing.assert_allclose(position.numpy(), step.positions, atol=1e-6)
+        if not lead:
+            following = graph_of(step.positions, run.simulator.radius)
+            assert edges == len(following.senders)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+from adaptgns.config import Loss
 from adaptgns.losses import training_loss
 from adaptgns.network import Prediction
 
@@ -32,6 +33,22 @@ def test_mse_is_torchs_over_mobile_particles(case) -> None:
     prediction, target, mobile = case
     expected = nn.MSELoss()(prediction.acceleration[mobile], target[mobile])
     torch.testing.assert_close(training_loss("mse", prediction, target, mobile), expected)
+
+
+@pytest.mark.parametrize(("kind", "power"), [("nll", 1.0), ("beta-nll", 0.5), ("mse", 0.0)])
+def test_a_given_variance_weighs_and_learns_nothing(case, kind: Loss, power: float) -> None:
+    prediction, target, mobile = case
+    given = torch.linspace(0.1, 2, 7, requires_grad=True)
+    own = prediction.variance.clone().requires_grad_()
+    acceleration = prediction.acceleration.clone().requires_grad_()
+    loss = training_loss(kind, Prediction(acceleration, own), target, mobile, variance=given)
+    squared = (acceleration - target).square().sum(1)
+    half = 3 if kind == "mse" else 2
+    torch.testing.assert_close(loss, (squared / (half * given.detach() ** power))[mobile].mean())
+    loss.backward()
+    assert own.grad is None
+    assert given.grad is None
+    assert (acceleration.grad[mobile] != 0).all()
 
 
 def test_kinematic_particles_carry_no_gradient(case) -> None:

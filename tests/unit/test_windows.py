@@ -71,11 +71,13 @@ def test_noise_moves_the_following_position_with_the_last(windows: Windows) -> N
 def test_target_undoes_the_noise_of_the_last_velocity(windows: Windows) -> None:
     simulator = Simulator(windows.config.model, windows.metadata, noise=3e-4, variance=True)
     batch = windows.collate([windows[0, 5]])
-    advanced = simulator.advance(batch.window, simulator.target(batch.window, batch.following))
+    advanced = simulator.advance(
+        batch.window, simulator.target(batch.window, batch.following[:, 0])
+    )
     clean = Windows(windows.trajectories, windows.metadata, windows.config, noise=0.0)
     after = clean.collate([clean[0, 5]])
     noise = batch.window[:, -1] - after.window[:, -1]
-    torch.testing.assert_close(advanced - noise, after.following, rtol=0, atol=3e-7)
+    torch.testing.assert_close(advanced - noise, after.following[:, 0], rtol=0, atol=3e-7)
 
 
 def test_kinematic_particles_carry_no_noise(windows: Windows) -> None:
@@ -135,14 +137,36 @@ def test_adaptive_training_reads_one_frame_more(windows: Windows) -> None:
     assert len(longer) == len(windows) - len(windows.trajectories)
 
 
-def test_position_correction_undoes_its_share(windows: Windows) -> None:
-    config = replace(windows.config, position_correction=0.25)
-    corrected = Windows(windows.trajectories, windows.metadata, config, noise=3e-4)[0, 5].positions
-    plain = windows[0, 5].positions
-    clean = Windows(windows.trajectories, windows.metadata, config, noise=0.0)[0, 5].positions
+def test_corrections_undo_their_share(windows: Windows) -> None:
+    config = replace(windows.config, position_correction=0.25, velocity_correction=0.4)
+    corrected, plain, clean = (
+        Windows(windows.trajectories, windows.metadata, c, noise=noise)[0, 5].positions
+        for c, noise in ((config, 3e-4), (windows.config, 3e-4), (windows.config, 0.0))
+    )
     np.testing.assert_array_equal(corrected[:-1], plain[:-1])
-    noise = plain[-2] - clean[-2]
-    np.testing.assert_allclose(corrected[-1] - clean[-1], 0.75 * noise, atol=1e-7)
+    noise = plain - clean
+    np.testing.assert_allclose(
+        corrected[-1] - clean[-1],
+        0.75 * noise[-2] + 0.6 * (noise[-2] - noise[-3]),
+        atol=2e-7,
+    )
+
+
+def test_several_frames_follow_and_undo_the_noise_further(windows: Windows) -> None:
+    shares = replace(windows.config, unroll=3, position_correction=0.25, velocity_correction=0.4)
+    noisy, clean = (
+        Windows(windows.trajectories, windows.metadata, shares, noise=noise)
+        for noise in (3e-4, 0.0)
+    )
+    batch = noisy.collate([noisy[0, 3]])
+    assert batch.following.shape[1] == 3
+    assert torch.equal(batch.following[:, 0], batch.frames[:, 6])
+    assert len(noisy) == len(windows) - 2 * len(windows.trajectories)
+    offsets = noisy[0, 3].positions - clean[0, 3].positions
+    velocities = np.diff(offsets, axis=0)
+    for frame in (6, 7, 8):
+        undone = 0.6 * velocities[frame - 2] - 0.25 * offsets[frame - 1]
+        np.testing.assert_allclose(velocities[frame - 1], undone, atol=3e-7)
 
 
 def test_compression_moves_all_frames_alike_and_the_target_answers(windows: Windows) -> None:
