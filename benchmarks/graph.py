@@ -39,13 +39,16 @@ TAU, FACTOR = 70.0, 1.267
 
 
 def timed(builders: dict[str, Callable[[], Any]], seconds: float) -> dict[str, float]:
-    """Median milliseconds of each builder over rounds of all, for about ``seconds``."""
+    """Median milliseconds of each builder over rounds of all, for about ``seconds``.
+
+    Every timed call follows an untimed one of the same builder, as in a loop over steps: what the
+    builder before it left in the caches and of the system's memory is not its own cost.
+    """
     times: dict[str, list[float]] = {name: [] for name in builders}
-    for build in builders.values():
-        build()
     end = time.perf_counter() + seconds
     while time.perf_counter() < end or len(times["scipy"]) < 3:
         for name, build in builders.items():
+            build()
             start = time.perf_counter()
             build()
             times[name].append(1e3 * (time.perf_counter() - start))
