@@ -79,7 +79,8 @@ def compression(
         most = np.maximum(extent / (2 * radius), 1)
         halves = np.floor(most ** rng.random(len(extent))) * (rng.random(len(extent)) < 0.8)
         halves = np.where(periodic, 2 * np.ceil(halves / 2), halves)
-        shift = np.where(periodic, rng.uniform(0, 2 * np.pi, len(extent)), 0)
+        shift = np.zeros(len(extent))
+        shift[np.array(periodic)] = rng.uniform(0, 2 * np.pi, sum(periodic))
         sign = rng.choice([-1, 1])
         wave = np.pi * halves / extent
         square = (wave**2).sum()

@@ -140,11 +140,12 @@ class Windows(Dataset[Sample]):
             inputs += walk
             # What follows moves along, so that each target undoes no more of the noise of the
             # velocity and the position before it than the shares asked for.
-            offset, velocity = walk[-1], walk[-1] - walk[-2]
+            before, offset = walk[-2], walk[-1]
             for frame in range(config.unroll):
-                velocity = np.float32(1 - config.velocity_correction) * velocity
-                velocity -= np.float32(config.position_correction) * offset
-                offset = offset + velocity
+                velocity = offset - before
+                before = offset
+                offset = np.float32(1 - config.position_correction) * offset
+                offset += np.float32(1 - config.velocity_correction) * velocity
                 following[frame] += offset
         if config.drift > 0:
             drift = drift_noise(rng, first, dim, config.drift)
