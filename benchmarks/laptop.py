@@ -4,7 +4,7 @@
 
 DATA is what ``python -m adaptgns.train --data`` takes, and OPTIONS are passed on to it. Runs lie in
 ``runs/benchmark``; one that was interrupted goes on, and one that has ended is not repeated. One
-that was made with other options is told, and its folder is to be removed first.
+that was made with other options is refused: its folder is to be removed first.
 """
 
 from __future__ import annotations

@@ -71,6 +71,10 @@ class ModelConfig:
     def __post_init__(self) -> None:
         _require(self, latent=COUNT, hidden_layers=COUNT, steps=COUNT, radius=POSITIVE)
 
+    def radius_or(self, default: float) -> float:
+        """The radius, or the data set's."""
+        return default if self.radius is None else self.radius
+
 
 @dataclass(frozen=True)
 class AdaptiveConfig:
@@ -178,7 +182,8 @@ class TrainConfig:
     that undoes them; none in samples with kinematic particles. 0: none at all, as GNS."""
     unroll: int = 1
     """Frames that each sample predicts one after the other, with gradients through all of them, in
-    the second half of the training; 1: never more than one, as GNS."""
+    the second half of the training. The noise is undone by its shares, what the model itself adds
+    in full. 1: never more than one frame, as GNS."""
     mirror: bool = False
     """Reflect every other sample along the first axis (for physics that is symmetric there)."""
     seed: int = 0

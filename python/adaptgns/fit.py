@@ -8,6 +8,7 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import (
@@ -43,6 +44,8 @@ from adaptgns.windows import Batch, Windows, training_batches
 
 LOG_EVERY = 100
 """Steps between lines of the metrics log."""
+SHOW_EVERY = 10
+"""Steps between what the progress bar shows."""
 
 
 class TrainingStopped(Exception):  # noqa: N818 (not an error: nothing is lost)
@@ -93,6 +96,11 @@ class Trainer:
                     f"{name}: the run was started with {saved}; got {given}; what a checkpoint's "
                     "weights are made for stays as it is, or is trained anew in another folder"
                 )
+        if self.config.steps < checkpoint.step:
+            raise ValueError(
+                f"steps: the run has trained {checkpoint.step} steps; got {self.config.steps}, "
+                "accepted is as many or more"
+            )
         self.simulator.load_state_dict(checkpoint.group("model"))
         state: dict[int, dict[str, Tensor]] = {}
         for name, tensor in checkpoint.group("optimizer").items():
@@ -154,6 +162,10 @@ class Trainer:
                 losses.append(self.train_step(next(batches).to(self.device)))
                 self.step += 1
                 progress.advance(task)
+                if self.step % SHOW_EVERY == 0:
+                    speed = len(losses) / (time.perf_counter() - logged)
+                    loss = float(torch.stack(losses).mean())
+                    progress.update(task, loss=f"{loss:.4g}", speed=f"{speed:.1f}")
                 last = self.step == config.steps
                 if self.step % LOG_EVERY == 0 or last:
                     loss = self._mean_loss(losses)
@@ -162,7 +174,6 @@ class Trainer:
                         self.step,
                         {"loss": loss, "lr": self.learning_rate(), "steps_per_second": speed},
                     )
-                    progress.update(task, loss=f"{loss:.4g}", speed=f"{speed:.1f}")
                     losses.clear()
                     logged = time.perf_counter()
                 if self.valid is not None and (self.step % config.validate_every == 0 or last):
@@ -234,21 +245,23 @@ class Trainer:
         """The graph of ``window`` after the prediction one frame ``earlier``."""
         if not self.config.model.edges:
             return None
-        positions, radius = window[:, -1].detach().cpu().numpy(), self.simulator.radius
-        adaptive, mobile = self.config.adaptive, batch.mobile.cpu().numpy()
-        build = (
-            partial(radius_graph, positions, radius)
-            if self.config.graph == "base"
-            else partial(
+        positions = window[:, -1].detach().cpu().numpy()
+        if not np.isfinite(positions).all():
+            raise self._diverged("the predicted positions became infinite or NaN")
+        build = partial(radius_graph, positions, self.simulator.radius)
+        if self.config.graph == "adaptive":
+            sigma = to_sigma(earlier)
+            if not np.isfinite(sigma).all():
+                raise self._diverged("the predicted variance became infinite or NaN")
+            build = partial(
                 adaptive_graph,
                 positions,
-                to_sigma(earlier),
-                radius,
-                adaptive.tau,
-                adaptive.factor,
-                eligible=mobile,
+                sigma,
+                self.simulator.radius,
+                self.config.adaptive.tau,
+                self.config.adaptive.factor,
+                eligible=batch.mobile.cpu().numpy(),
             )
-        )
         edges = build(
             ptr=batch.ptr.cpu().numpy(),
             box=self.metadata.box,

@@ -39,7 +39,7 @@ _SUSPICIOUS = 2.0
 class InspectConfig:
     """Show what a data set holds, its graph statistics and the problems found in it.
 
-    Exits with 1 if the data can't be used.
+    Exits with 1 if the data can be read but not used, with 2 if they cannot be read.
     """
 
     data: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]

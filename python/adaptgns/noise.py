@@ -53,27 +53,29 @@ def compression(
     *,
     strain: float,
     radius: float,
+    frames: int = 1,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A smooth compression of ``positions`` ``[N, d]``, and the acceleration that answers it.
+    """A smooth compression of ``positions`` ``[N, d]``, and how the next ``frames`` answer it.
 
     Random-walk noise is new for every particle, and says nothing of errors that neighbours share:
     a model that brakes a falling block too late piles it up, all of it, and solver data hold no
     piles to learn from. The compression is the gradient of a few standing waves, of 4 ``radius``
     to twice the extent of ``bounds`` ``[d, 2]`` in length, that move nothing across a wall; along
-    periodic axes they begin anywhere. The acceleration is that of a fluid in which sound crosses
-    half a ``radius`` per frame, bounded where the waves are short.
+    periodic axes they begin anywhere. They are answered with the acceleration of a fluid in which
+    sound crosses half a ``radius`` per frame, bounded where the waves are short.
 
     Args:
         strain: scale of the relative change of density, drawn anew (half-normal) at each call.
 
     Returns:
-        displacement (length) and acceleration (length per frame squared), each ``[N, d]``.
+        The displacement ``[N, d]``, and by how much each following frame differs from it,
+        ``[frames, N, d]``, the first of which is the acceleration; lengths.
     """
     low, extent = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
     phase = np.pi * (positions - low) / extent  # [N, d]
     amplitude = strain * abs(rng.normal()) / np.sqrt(WAVES)
     displacement = np.zeros(positions.shape)
-    acceleration = np.zeros(positions.shape)
+    answers = np.zeros((frames, *positions.shape))
     for _ in range(WAVES):
         # Half waves along each axis, log-uniform; whole ones where the axis is periodic.
         most = np.maximum(extent / (2 * radius), 1)
@@ -96,5 +98,9 @@ def compression(
         part = sign * amplitude / square * gradient
         displacement += part
         stiffness = (radius / 2) ** 2 * square
-        acceleration -= stiffness / (1 + stiffness / STRONGEST) * part
-    return displacement.astype(np.float32), acceleration.astype(np.float32)
+        share, speed = 0.0, 0.0  # that is taken back of the wave
+        for answer in answers:
+            speed += (1 - share) * stiffness / (1 + stiffness / STRONGEST)
+            share += speed
+            answer -= share * part  # noqa: PLW2901 (in place)
+    return displacement.astype(np.float32), answers.astype(np.float32)

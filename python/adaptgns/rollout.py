@@ -204,6 +204,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             prog="python -m adaptgns.rollout",
             config=(tyro.conf.OmitArgPrefixes,),
         )
+        if config.out.exists():
+            raise ValueError(f"--out: {config.out} is there already; remove it or name another")
         write_rollouts(config, console)
     console.print(f"{config.out}", highlight=False)
 

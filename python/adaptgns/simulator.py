@@ -15,7 +15,7 @@ from adaptgns.config import HISTORY, TYPE_EMBEDDING, ModelConfig
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectory import PARTICLE_TYPES
 from adaptgns.network import EncodeProcessDecode, Prediction
-from adaptgns.segment import Graph
+from adaptgns.segment import Graph, at_receivers, at_senders
 
 RELATIVE_SPEED = 0.2
 """How far neighbours' velocities differ, as a share of the velocities' std: the scale of their
@@ -35,7 +35,7 @@ class Simulator(nn.Module):
         super().__init__()
         self.config = config
         self.metadata = metadata
-        self.radius = config.radius if config.radius is not None else metadata.radius
+        self.radius = config.radius_or(metadata.radius)
         dim = metadata.dim
         open_axes = [axis for axis in range(dim) if not metadata.periodic[axis]]
         self.type_embedding = nn.Embedding(PARTICLE_TYPES, TYPE_EMBEDDING)
@@ -124,14 +124,16 @@ class Simulator(nn.Module):
         """Features ``[E, :]`` of positions ``[N, H, d]``: (sender - receiver) / radius and its
         norm; with ``relative_motion`` also the difference of the last velocities and its part
         along the edge."""
-        positions, senders, receivers = window[:, -1], graph.senders, graph.receivers
-        displacement = self.displacement(positions[senders], positions[receivers]) / self.radius
+        positions = window[:, -1]
+        displacement = self.displacement(
+            at_senders(positions, graph), at_receivers(positions, graph)
+        )
+        displacement = displacement / self.radius
         parts = [displacement, displacement.norm(dim=1, keepdim=True)]
         if self.config.relative_motion:
             velocity = self.displacement(positions, window[:, -2])
-            relative = (velocity[senders] - velocity[receivers]) / (
-                RELATIVE_SPEED * self.velocity_std
-            )
+            relative = at_senders(velocity, graph) - at_receivers(velocity, graph)
+            relative = relative / (RELATIVE_SPEED * self.velocity_std)
             direction = functional.normalize(displacement, dim=1, eps=1e-3)
             parts += [relative, (relative * direction).sum(dim=1, keepdim=True)]
         return torch.cat(parts, dim=1)

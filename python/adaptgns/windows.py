@@ -100,7 +100,7 @@ class Windows(Dataset[Sample]):
         self.metadata = metadata
         self.config = config
         self.noise = noise
-        self.radius = metadata.radius if config.model.radius is None else config.model.radius
+        self.radius = config.model.radius_or(metadata.radius)
         self.frames = HISTORY + config.unroll + (config.graph == "adaptive")
         counts = np.maximum(trajectories.lengths - self.frames + 1, 0)
         self.starts = np.concatenate([[0], np.cumsum(counts)])
@@ -152,17 +152,17 @@ class Windows(Dataset[Sample]):
             positions[:first] += drift[:, None] * mobile[:, None]
         # Where solid bodies move or stand, the fluid around them cannot go just anywhere.
         if config.compression > 0 and mobile.all():
-            displacement, acceleration = compression(
+            displacement, answers = compression(
                 rng,
                 inputs[-1],
                 np.array(self.metadata.bounds),
                 self.metadata.periodic,
                 strain=config.compression,
                 radius=self.radius,
+                frames=config.unroll,
             )
             positions += displacement
-            for frame in range(config.unroll):
-                following[frame] += acceleration * np.float32((frame + 1) * (frame + 2) / 2)
+            following += answers
 
     def collate(self, samples: Sequence[Sample]) -> Batch:
         """One batch with its base graph, built on the noisy positions."""

@@ -21,8 +21,10 @@ from adaptgns.config import AdaptiveConfig, TrainConfig
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.fit import Trainer, TrainingStopped
-from adaptgns.policies import Adaptive, Fixed
-from adaptgns.rollout import steps
+from adaptgns.graph import adaptive_graph
+from adaptgns.network import Prediction
+from adaptgns.policies import Adaptive
+from adaptgns.rollout import steps, to_sigma
 from adaptgns.segment import Graph
 from tests.conftest import graph_of
 
@@ -113,6 +115,21 @@ def test_a_loss_that_is_not_finite_stops_with_what_to_look_at(
     kept = read_checkpoint(tmp_path / LAST)
     assert kept.step == 8
     assert all(t.isfinite().all() for t in kept.tensors.values())
+
+
+@pytest.mark.parametrize("graph", ["base", "adaptive"])
+def test_positions_that_are_not_finite_stop_likewise(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, graph: Literal["base", "adaptive"]
+) -> None:
+    run = trainer(drops, tmp_path, replace(small_config, unroll=2, graph=graph))
+    run.step = small_config.steps // 2
+    batch = run.windows.collate([run.windows[0, 0]])
+    run.save()
+    with torch.no_grad():
+        next(run.simulator.network.decoder.parameters()).fill_(torch.nan)
+        next(run.simulator.network.node_encoder.parameters()).fill_(torch.nan)
+    with pytest.raises(TrainingStopped, match=r"became infinite or NaN.*last good state.*--lr"):
+        run.train_step(batch)
 
 
 def test_adaptive_training_needs_edges_and_a_variance(
@@ -214,27 +231,58 @@ def test_unrolled_windows_are_those_of_a_rollout(
     config = replace(small_config, graph=graph, noise=0.0, adaptive=rule, unroll=3)
     run = trainer(drops, tmp_path, config)
     batch = run.windows.collate([run.windows[0, 0]])
-    seen: list[tuple[torch.Tensor, int]] = []
+    seen: list[torch.Tensor] = []
+    graphs: list[Graph] = []
+    sigmas: list[np.ndarray] = []
 
-    def record(_: object, arguments: tuple[torch.Tensor, object, Graph, object]) -> None:
-        seen.append((arguments[0].detach()[:, -1], len(arguments[2].senders)))
+    def record(_: object, arguments: tuple[torch.Tensor, object, Graph], out: Prediction) -> None:
+        seen.append(arguments[0][:, -1])
+        graphs.append(arguments[2])
+        sigmas.append(to_sigma(out))
 
-    trajectory = open_split(drops, "train")[0]
-    true = replace(trajectory, positions=trajectory.positions[lead:])
-    policy = Adaptive(rule) if lead else Fixed()
-    rolled = list(steps(run.simulator, true, policy, 3))
-    run.simulator.register_forward_pre_hook(record)
+    run.simulator.register_forward_hook(record)
     run.train_step(batch)
     assert len(seen) == 1 + lead  # single steps in the first half
 
-    seen.clear()
     run = trainer(drops, tmp_path, config)
-    run.simulator.register_forward_pre_hook(record)
+    true = torch.from_numpy(open_split(drops, "train")[0].positions).transpose(0, 1)
+    window = true[:, lead : lead + 6].contiguous()
+    expected = []
+    with torch.no_grad():
+        for k in range(3):
+            before = true[:, :6].contiguous() if lead and not k else window
+            positions = window[:, -1].numpy()
+            if lead:
+                if not k:
+                    sigma = to_sigma(
+                        run.simulator(before, batch.particle_type, batch.graph, batch.material)
+                    )
+                index, offsets = adaptive_graph(
+                    positions,
+                    sigma,
+                    run.simulator.radius,
+                    rule.tau,
+                    rule.factor,
+                    self_edges=True,
+                    return_offsets=True,
+                )
+                used = Graph.from_numpy(index, offsets)
+            else:
+                used = graph_of(positions, run.simulator.radius)
+            out = run.simulator(window, batch.particle_type, used, batch.material)
+            sigma = to_sigma(out)
+            expected.append((window[:, -1], used.senders))
+            following = run.simulator.advance(window, out.acceleration)
+            window = torch.cat([window[:, 1:], following[:, None]], dim=1)
+    for record_ in (seen, graphs, sigmas):
+        record_.clear()
+    run.simulator.register_forward_hook(record)
     run.step = config.steps // 2
     run.train_step(batch)
     assert len(seen) == 3 + lead
-    for (position, edges), step in zip(seen[1 + lead :], rolled, strict=False):
-        np.testing.assert_allclose(position.numpy(), step.positions, atol=1e-6)
-        if not lead:
-            following = graph_of(step.positions, run.simulator.radius)
-            assert edges == len(following.senders)
+    assert [p.requires_grad for p in seen[lead:]] == [False, True, True]
+    for position, graph_, (where, senders) in zip(
+        seen[lead:], graphs[lead:], expected, strict=True
+    ):
+        torch.testing.assert_close(position.detach(), where, rtol=0, atol=1e-6)
+        assert torch.equal(graph_.senders, senders)

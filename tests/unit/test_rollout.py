@@ -167,3 +167,12 @@ def test_wrong_options_are_told_plainly(capsys: pytest.CaptureFixture[str]) -> N
         main(["--checkpoint", "run", "--out", "x.h5", "--steps", "0"])
     assert exit_.value.code == 2
     assert "steps: got 0; accepted are whole numbers >= 1" in capsys.readouterr().err
+
+
+def test_a_file_that_is_there_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "rollout.h5"
+    out.write_bytes(b"dear")
+    with pytest.raises(SystemExit):
+        main(["--checkpoint", "run", "--out", str(out)])
+    assert "is there already" in capsys.readouterr().err
+    assert out.read_bytes() == b"dear"

@@ -200,3 +200,27 @@ def test_relative_motion_across_a_period(metadata: Metadata) -> None:
         rtol=0,
         atol=1e-3,
     )
+
+
+def test_gradients_of_positions_do_not_depend_on_chance(metadata: Metadata) -> None:
+    """Two threads, and more edges than torch sums on one."""
+    torch.manual_seed(0)
+    config = replace(SMALL, relative_motion=True)
+    simulator = Simulator(config, metadata, noise=3e-4, variance=True)
+    window = random_windows(np.random.default_rng(0), 4000).requires_grad_()
+    graph = graph_of(window[:, -1].detach().numpy(), 0.015)
+    weights = torch.randn(len(graph.senders), 6)
+    assert len(weights) > 1 << 17
+
+    def gradient() -> torch.Tensor:
+        features = simulator.edge_features(window, graph)
+        return torch.autograd.grad((features * weights).sum(), window)[0]
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        first, *others = [gradient() for _ in range(6)]
+    finally:
+        torch.set_num_threads(threads)
+    assert first.isfinite().all()
+    assert all(torch.equal(first, other) for other in others)

@@ -149,7 +149,8 @@ impl Work for Writing<'_> {
         for ((receiver, row), count) in (self.first..).zip(self.rows).zip(counts) {
             let dropped = if self.drop_self { receiver } else { NONE };
             let found = count + usize::from(self.drop_self);
-            write_sorted(lanes, row, found, dropped, &mut self.senders[at..]);
+            // SAFETY: a search finds every sender once, the receiver among them.
+            unsafe { write_sorted(lanes, row, found, dropped, &mut self.senders[at..]) };
             fill(&mut self.receivers[at..], count, i64::from(receiver));
             at += count;
         }

@@ -74,7 +74,8 @@ pub(super) fn reserve<T>(count: usize) -> Option<Vec<T>> {
             // SAFETY: the range lies inside the allocation, and the advice changes nothing
             // that is in it; where it is not taken, nothing is lost.
             unsafe {
-                libc::madvise(start.add(skipped), bytes - skipped, libc::MADV_HUGEPAGE);
+                let whole = (bytes - skipped) / PAGE * PAGE;
+                libc::madvise(start.add(skipped), whole, libc::MADV_HUGEPAGE);
             }
         }
     }

@@ -16,8 +16,11 @@ pub(super) const NONE: i32 = i32::MAX;
 ///
 /// In a short row each sender's place is the number of smaller ones. That is quadratic,
 /// but several comparisons go to an instruction, and no branch depends on their outcome.
+///
+/// # Safety
+/// The senders are distinct, and `dropped` is one of them or [`NONE`].
 #[inline(always)]
-pub(super) fn write_sorted<L: Lanes>(
+pub(super) unsafe fn write_sorted<L: Lanes>(
     lanes: L,
     row: &[i32],
     n: usize,
@@ -32,7 +35,8 @@ pub(super) fn write_sorted<L: Lanes>(
         let keys = row[start..].first_chunk().expect("room");
         let places = lanes.places(keys, n - start, &row[..n], dropped, kept as i32);
         for (&key, &place) in keys.iter().zip(&places) {
-            // SAFETY: a place is at most `kept`, and there are more.
+            debug_assert!((0..=kept).contains(&(place as usize)));
+            // SAFETY: of distinct senders at most `kept` are smaller, and there are more places.
             unsafe { out.get_unchecked_mut(place as usize) }.write(i64::from(key));
         }
     }

@@ -121,33 +121,55 @@ fn build<T: Scalar, const D: usize>(
 
 #[cfg(test)]
 mod tests {
+    use std::num::NonZeroUsize;
+
     use super::*;
     use crate::graph::lanes::PLAIN;
 
     #[test]
     fn every_processor_builds_the_same_graph() {
-        // A sequence without pattern (Weyl), its radii likewise.
-        let weyl = |n: usize| (1..=n).map(|i| (i as f64 * 0.754_877_666_246_693).fract());
-        let positions: Vec<f64> = weyl(1200).collect();
-        for (dim, period) in [(2, None), (2, Some(&[1.0, 0.0][..])), (3, None)] {
+        check::<f32>();
+        check::<f64>();
+    }
+
+    fn check<T: Scalar>() {
+        const COUNT: usize = 600;
+        /// A sequence that fills the unit interval evenly, another one for each `alpha`.
+        fn weyl<T: Scalar>(alpha: f64) -> impl Fn(usize) -> T {
+            move |i| T::from_f64((i as f64 * alpha).fract())
+        }
+        let axes = [0.819_172_513_4, 0.671_043_606_7, 0.549_700_477_9].map(weyl::<T>);
+        let periodic = [1.0, 0.0];
+        for (dim, r, period) in [
+            (2, 0.06, None),
+            (2, 0.06, Some(&periodic[..])),
+            (3, 0.15, None),
+        ] {
+            let positions: Vec<T> = (0..COUNT)
+                .flat_map(|i| axes[..dim].iter().map(move |axis| axis(i)))
+                .collect();
             let particles = Particles {
                 positions: &positions,
                 dim,
                 ptr: None,
                 period,
             };
-            let radii: Vec<f64> = weyl(1200 / dim).map(|w| 0.05 + 0.1 * w).collect();
+            let radii: Vec<f64> = (0..COUNT)
+                .map(|i| r * (0.5 + weyl::<f64>(0.754_877_666_2)(i)))
+                .collect();
             for self_edges in [false, true] {
                 let options = Options {
                     self_edges,
-                    threads: threads::Threads::AtMost(std::num::NonZeroUsize::MIN),
+                    threads: threads::Threads::AtMost(NonZeroUsize::MIN),
                 };
                 let build = |plain| {
                     PLAIN.set(plain);
-                    [Radius::Uniform(0.1), Radius::PerParticle(&radii)]
+                    [Radius::Uniform(r), Radius::PerParticle(&radii)]
                         .map(|radius| radius_graph(&particles, radius, &options).expect("room"))
                 };
-                assert_eq!(build(true), build(false), "{dim} {period:?} {self_edges}");
+                let graphs = build(true);
+                assert!(graphs.iter().all(|graph| graph.senders().len() > 4 * COUNT));
+                assert_eq!(graphs, build(false), "{dim} {period:?} {self_edges}");
             }
         }
     }
