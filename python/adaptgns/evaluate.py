@@ -105,8 +105,8 @@ def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
             for name, predicted in baseline_predictions(truth):
                 baselines[name].add_positions(truth, predicted, marks)
         measures = [
-            tally.measures(file.label, describe_policy(file), file)
-            for tally, file in zip(tallies, opened, strict=True)
+            tally.measures(label, describe_policy(file), file)
+            for tally, label, file in zip(tallies, distinct_labels(opened), opened, strict=True)
         ]
         return Report(
             marks=marks,
@@ -278,6 +278,15 @@ def describe_policy(file: RolloutFile) -> str:
     if trained is None or file.graph_radius == trained:
         return file.policy
     return f"{file.policy}, r = {file.graph_radius:g}"
+
+
+def distinct_labels(files: Sequence[RolloutFile]) -> list[str]:
+    """The models' labels, with the file's path where model and policy alone are not enough."""
+    kinds = [(file.label, describe_policy(file)) for file in files]
+    return [
+        file.label if kinds.count(kind) == 1 else f"{file.label} ({file.path})"
+        for file, kind in zip(files, kinds, strict=True)
+    ]
 
 
 def check_same_trajectories(files: Sequence[RolloutFile]) -> None:

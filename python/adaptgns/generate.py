@@ -85,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         # Leaving the interpreter would wait for the solver's threads to end their trajectories.
         sys.stderr.flush()
         os._exit(128 + 2)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MemoryError) as error:
         console.print(f"error: {_explain(error)}", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(2) from None
     print(f"{config.out}: data set of {config.scene}; look at it with")
@@ -98,7 +98,7 @@ def _explain(error: Exception) -> str:
             "the disk is full; the unfinished file was removed, finished splits are kept, and the "
             "same command goes on with what is missing"
         )
-    return str(error)
+    return str(error) or type(error).__name__
 
 
 if __name__ == "__main__":

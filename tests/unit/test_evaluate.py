@@ -152,6 +152,13 @@ def test_only_the_same_trajectories_are_compared(tmp_path: Path, metadata: Metad
         measure([first, other])
 
 
+def test_rollouts_of_one_kind_are_told_apart(tmp_path: Path, metadata: Metadata) -> None:
+    files = [write_rollout(tmp_path / name, metadata) for name in ("a.h5", "b.h5")]
+    labels = [rollout.label for rollout in measure(files, [12]).rollouts]
+    assert labels == [f"GNS nll ({file})" for file in files]
+    assert measure(files[:1], [12]).rollouts[0].label == "GNS nll"
+
+
 def test_kinematic_particles_alone_can_not_be_measured(tmp_path: Path, metadata: Metadata) -> None:
     walls = replace(metadata, kinematic_types=(3, 5))
     with pytest.raises(ValueError, match=r"block 0 .* has kinematic particles only"):
