@@ -45,7 +45,7 @@ from adaptgns.windows import Batch, Windows, training_batches
 LOG_EVERY = 100
 """Steps between lines of the metrics log."""
 SHOW_EVERY = 10
-"""Steps between what the progress bar shows."""
+"""Steps between what the progress bar shows; divides those between lines of the log."""
 
 
 class TrainingStopped(Exception):  # noqa: N818 (not an error: nothing is lost)
@@ -162,17 +162,19 @@ class Trainer:
                 losses.append(self.train_step(next(batches).to(self.device)))
                 self.step += 1
                 progress.advance(task)
-                if self.step % SHOW_EVERY == 0:
-                    speed = len(losses) / (time.perf_counter() - logged)
-                    loss = float(torch.stack(losses).mean())
-                    progress.update(task, loss=f"{loss:.4g}", speed=f"{speed:.1f}")
                 last = self.step == config.steps
-                if self.step % LOG_EVERY == 0 or last:
-                    loss = self._mean_loss(losses)
+                if self.step % SHOW_EVERY == 0 or last:
+                    loss = float(torch.stack(losses).mean())
                     speed = len(losses) / (time.perf_counter() - logged)
+                    progress.update(task, loss=f"{loss:.4g}", speed=f"{speed:.1f}")
+                if self.step % LOG_EVERY == 0 or last:
                     log.write(
                         self.step,
-                        {"loss": loss, "lr": self.learning_rate(), "steps_per_second": speed},
+                        {
+                            "loss": self._mean_loss(losses),
+                            "lr": self.learning_rate(),
+                            "steps_per_second": speed,
+                        },
                     )
                     losses.clear()
                     logged = time.perf_counter()

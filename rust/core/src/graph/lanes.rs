@@ -8,7 +8,8 @@ pub(super) const BLOCK: usize = 8;
 
 /// The instructions that [`Work`] may use.
 pub(super) trait Lanes: Copy {
-    /// One bit per place, set where the value is at most its limit.
+    /// One bit per place, set where the value is at most its limit; the first place is the
+    /// lowest bit.
     fn at_most<T: Scalar>(self, values: &[T; BLOCK], limits: &[T; BLOCK]) -> u8;
 
     /// For each key, how many of `row` are smaller, without `dropped` among them. For a
@@ -87,7 +88,7 @@ struct Portable;
 impl Lanes for Portable {
     #[inline(always)]
     fn at_most<T: Scalar>(self, values: &[T; BLOCK], limits: &[T; BLOCK]) -> u8 {
-        T::at_most(values, limits)
+        (0..BLOCK).fold(0, |bits, l| bits | u8::from(values[l] <= limits[l]) << l)
     }
 
     #[inline(always)]

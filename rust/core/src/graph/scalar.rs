@@ -51,11 +51,8 @@ pub trait Scalar:
     fn is_normal(self) -> bool;
     /// A total order, the usual one for numbers that are not NaN.
     fn total_cmp(&self, other: &Self) -> std::cmp::Ordering;
-    /// One bit per place, set where the value is at most its limit; the first place is
-    /// the lowest bit.
-    #[doc(hidden)]
-    fn at_most(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8;
-    /// The same in vector instructions, which the compiler does not find by itself.
+    /// One bit per place, set where the value is at most its limit, the first place the
+    /// lowest bit: in vector instructions, which the compiler does not find by itself.
     ///
     /// # Safety
     /// The processor has AVX2.
@@ -103,10 +100,6 @@ macro_rules! scalar {
             #[inline(always)]
             fn total_cmp(&self, other: &Self) -> std::cmp::Ordering {
                 self.total_cmp(other)
-            }
-            #[inline(always)]
-            fn at_most(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8 {
-                (0..BLOCK).fold(0, |bits, l| bits | u8::from(values[l] <= limits[l]) << l)
             }
             #[cfg(target_arch = "x86_64")]
             #[inline(always)]
