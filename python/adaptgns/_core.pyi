@@ -1,10 +1,18 @@
 from collections.abc import Sequence
-from typing import Literal, TypeAlias, overload
+from typing import Literal, TypeAlias, final, overload
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["adaptive_graph", "knn_graph", "radius_graph", "simulate"]
+__all__ = [
+    "NetworkTape",
+    "adaptive_graph",
+    "knn_graph",
+    "network_backward",
+    "network_forward",
+    "radius_graph",
+    "simulate",
+]
 
 _Reals: TypeAlias = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 _Integers: TypeAlias = npt.NDArray[np.int64]
@@ -118,4 +126,69 @@ def simulate(
         ValueError: an argument outside what is accepted.
         OverflowError: a negative or too large integer.
         MemoryError: the trajectory does not fit in memory.
+    """
+
+_Floats: TypeAlias = npt.NDArray[np.float32]
+_Perceptrons: TypeAlias = Sequence[Sequence[_Floats]]
+_Edges: TypeAlias = tuple[_Floats, Sequence[_Integers]] | None
+
+@final
+class NetworkTape:
+    """What the backward pass needs of a forward pass."""
+
+def network_forward(
+    perceptrons: _Perceptrons,
+    node_features: _Floats,
+    edges: _Edges,
+    *,
+    heads: int,
+    keep: bool,
+    threads: int | None = None,
+) -> tuple[list[_Floats], NetworkTape | None]:
+    """The encode-process-decode network (Sanchez-Gonzalez et al. 2020) in float32.
+
+    All arrays are C-contiguous. Results are the same for any number of threads.
+
+    Args:
+        perceptrons: node encoder, edge encoder, each step's edge and node perceptron, heads;
+            without ``edges`` node encoder, a node perceptron per step, heads. Each is weight
+            [outputs, inputs] and bias [outputs] in turn, ReLU between them, and perhaps scale and
+            shift of a LayerNorm at last. Edge perceptrons see [receiver, sender, edge], node
+            perceptrons [sum of messages, node]; both are residual.
+        node_features: [N, :].
+        edges: features [E, :], then senders [E], receivers [E] and receivers' offsets [N + 1],
+            and for a backward pass the edges sorted by sender [E] and senders' offsets [N + 1];
+            None for a network without edges.
+        heads: how many of the last perceptrons are read from the last step's nodes.
+        keep: whether a backward pass follows.
+        threads: how many threads may work on the call, all cores if absent.
+
+    Returns:
+        The heads' outputs [N, :], and with ``keep`` the tape.
+
+    Raises:
+        ValueError, TypeError: arguments that do not fit together, by name.
+    """
+
+def network_backward(
+    perceptrons: _Perceptrons,
+    node_features: _Floats,
+    edges: _Edges,
+    tape: NetworkTape,
+    gradients: Sequence[_Floats],
+    *,
+    threads: int | None = None,
+) -> tuple[_Floats, _Floats, _Floats]:
+    """The way back through :func:`network_forward` with the same arguments.
+
+    Args:
+        tape: what the forward pass kept.
+        gradients: those of the heads' outputs, [N, :] each.
+
+    Returns:
+        Gradients, flat, of all parameters in order, of the node features, and of the edge
+        features (empty without edges).
+
+    Raises:
+        ValueError, TypeError: arguments that do not fit together, by name.
     """

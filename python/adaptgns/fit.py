@@ -47,6 +47,11 @@ LOG_EVERY = 100
 SHOW_EVERY = 10
 """Steps between what the progress bar shows; divides those between lines of the log."""
 
+SETTLED = 0.8
+"""Share of a cosine schedule after which checkpoints compete for the best: while the learning rate
+is high, rollouts of neighbouring checkpoints differ by chance, and few trajectories crown the
+luckiest."""
+
 
 class TrainingStopped(Exception):  # noqa: N818 (not an error: nothing is lost)
     """A run ended before its end; the message says why and how to go on."""
@@ -296,7 +301,11 @@ class Trainer:
         scores = validate(self.simulator, self.valid, self.config)
         self.simulator.train()
         log.write(self.step, scores)
-        if scores["valid_rollout_mse"] < self.best_score:
+        c = self.config
+        first_settled = (
+            c.schedule == "cosine" and self.step >= SETTLED * c.steps > self.step - c.validate_every
+        )
+        if first_settled or scores["valid_rollout_mse"] < self.best_score:
             self.best_score = scores["valid_rollout_mse"]
             write_checkpoint(self.folder / BEST, self.checkpoint(resumable=False))
 

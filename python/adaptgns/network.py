@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from adaptgns import fused
 from adaptgns.segment import Graph, at_receivers, at_senders, sum_at_receivers
 
 VARIANCE_FLOOR = 1e-8
@@ -102,15 +103,39 @@ class EncodeProcessDecode(nn.Module):
         self, node_features: Tensor, edge_features: Tensor | None, graph: Graph | None
     ) -> Prediction:
         """Predictions for ``node_features`` ``[N, :]`` and ``edge_features`` ``[E, :]``."""
-        nodes = self.node_encoder(node_features)
+        if fused.applies(node_features):
+            acceleration, *variances = fused.network(
+                self._perceptrons(), node_features, edge_features, graph, heads=len(self._heads())
+            )
+        else:
+            nodes = self._encode_and_process(node_features, edge_features, graph)
+            acceleration, *variances = (head(nodes) for head in self._heads())
+        variance = None
+        if variances:
+            variance = functional.softplus(variances[0]).squeeze(1) + VARIANCE_FLOOR
+        return Prediction(acceleration, variance)
+
+    def _encode_and_process(
+        self, node_features: Tensor, edge_features: Tensor | None, graph: Graph | None
+    ) -> Tensor:
+        nodes: Tensor = self.node_encoder(node_features)
         if self.edge_encoder is None:
             for layer in self.layers:
                 nodes = nodes + layer(nodes)
-        else:
-            edges = self.edge_encoder(edge_features)
-            for layer in self.layers:
-                nodes, edges = layer(nodes, edges, graph)
-        variance = None
-        if self.variance_head is not None:
-            variance = functional.softplus(self.variance_head(nodes)).squeeze(1) + VARIANCE_FLOOR
-        return Prediction(self.decoder(nodes), variance)
+            return nodes
+        edges = self.edge_encoder(edge_features)
+        for layer in self.layers:
+            nodes, edges = layer(nodes, edges, graph)
+        return nodes
+
+    def _heads(self) -> list[nn.Sequential]:
+        return [self.decoder] if self.variance_head is None else [self.decoder, self.variance_head]
+
+    def _perceptrons(self) -> list[nn.Module]:
+        """All of them, in the order in which data flow."""
+        encoders = [self.node_encoder]
+        steps: list[nn.Module] = list(self.layers)
+        if self.edge_encoder is not None:
+            encoders.append(self.edge_encoder)
+            steps = [perceptron for layer in self.layers for perceptron in layer.children()]
+        return [*encoders, *steps, *self._heads()]

@@ -5,6 +5,7 @@
 mod error;
 pub mod graph;
 pub mod mpm;
+pub mod network;
 pub mod threads;
 
 pub use error::Error;

@@ -5,12 +5,14 @@ mod arguments;
 mod errors;
 mod graph;
 mod mpm;
+mod network;
 
 use pyo3::prelude::*;
 
-/// Graph builders and the data generator of AdaptGNS.
+/// Graph builders, the data generator and the graph network of AdaptGNS.
 #[pymodule]
 fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     graph::register(module)?;
-    mpm::register(module)
+    mpm::register(module)?;
+    network::register(module)
 }

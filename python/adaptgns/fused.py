@@ -1,0 +1,113 @@
+"""The whole network in the Rust core, for float32 on the CPU.
+
+The same sums as :mod:`adaptgns.network` does with torch, in another order: block by block through
+all layers of a perceptron while the block lies in the cache, with less memory for the backward pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from adaptgns._core import network_backward, network_forward
+from adaptgns.segment import Graph
+
+
+def applies(features: Tensor) -> bool:
+    """Whether :func:`network` can do what torch would with ``features``."""
+    return (
+        features.device.type == "cpu"
+        and features.dtype == torch.float32
+        and not torch.is_autocast_enabled("cpu")
+        and not torch.compiler.is_compiling()
+    )
+
+
+def network(
+    perceptrons: Sequence[nn.Module],
+    node_features: Tensor,
+    edge_features: Tensor | None,
+    graph: Graph | None,
+    *,
+    heads: int,
+) -> list[Tensor]:
+    """Outputs ``[N, :]`` of the last ``heads`` of the ``perceptrons``: node encoder, edge encoder,
+    each step's edge and node perceptron, heads; without ``graph`` no edge perceptrons."""
+    parameters = [list(perceptron.parameters()) for perceptron in perceptrons]
+    sizes = [len(own) for own in parameters]
+    flat = [parameter for own in parameters for parameter in own]
+    out: tuple[Tensor, ...] = _Network.apply(
+        graph, sizes, heads, node_features, edge_features, *flat
+    )
+    return list(out)
+
+
+def _array(tensor: Tensor) -> Any:
+    return tensor.detach().contiguous().numpy()
+
+
+def _edges(graph: Graph | None, features: Tensor | None) -> Any:
+    if graph is None or features is None:
+        return None
+    index = [graph.senders, graph.receivers, graph.receiver_offsets]
+    if graph.by_sender is not None and graph.sender_offsets is not None:
+        index += [graph.by_sender, graph.sender_offsets]
+    return _array(features), [_array(part) for part in index]
+
+
+def _perceptrons(sizes: list[int], parameters: Sequence[Tensor]) -> Any:
+    arrays = iter(_array(parameter) for parameter in parameters)
+    return [[next(arrays) for _ in range(size)] for size in sizes]
+
+
+class _Network(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        graph: Graph | None,
+        sizes: list[int],
+        heads: int,
+        node_features: Tensor,
+        edge_features: Tensor | None,
+        *parameters: Tensor,
+    ) -> tuple[Tensor, ...]:
+        outputs, tape = network_forward(
+            _perceptrons(sizes, parameters),
+            _array(node_features),
+            _edges(graph, edge_features),
+            heads=heads,
+            keep=any(ctx.needs_input_grad),
+            threads=torch.get_num_threads(),
+        )
+        ctx.graph, ctx.sizes, ctx.tape = graph, sizes, tape
+        ctx.save_for_backward(node_features, edge_features, *parameters)
+        return tuple(torch.from_numpy(output) for output in outputs)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
+        node_features, edge_features, *parameters = ctx.saved_tensors
+        of_parameters, of_nodes, of_edges = network_backward(
+            _perceptrons(ctx.sizes, parameters),
+            _array(node_features),
+            _edges(ctx.graph, edge_features),
+            ctx.tape,
+            [_array(gradient) for gradient in gradients],
+            threads=torch.get_num_threads(),
+        )
+        parts = torch.from_numpy(of_parameters).split([p.numel() for p in parameters])
+        to_edges = None
+        if edge_features is not None:
+            to_edges = torch.from_numpy(of_edges).view_as(edge_features)
+        return (
+            None,
+            None,
+            None,
+            torch.from_numpy(of_nodes).view_as(node_features),
+            to_edges,
+            *(part.view_as(p) for part, p in zip(parts, parameters, strict=True)),
+        )

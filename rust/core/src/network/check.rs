@@ -1,0 +1,194 @@
+//! Whether what a caller hands in fits together, so that nothing behind it can fail.
+
+use super::mlp::Mlp;
+use super::{Edges, Features, Network, Tape};
+use crate::Error;
+
+impl Network<'_> {
+    /// How many nodes there are.
+    pub(super) fn node_count(&self, features: &Features<'_>) -> usize {
+        features.nodes.len() / self.node_encoder.linears[0].inputs()
+    }
+
+    pub(super) fn check(&self, features: &Features<'_>) -> Result<(), Error> {
+        check_mlp(&self.node_encoder, None)?;
+        let width = self.width();
+        let inputs = self.node_encoder.linears[0].inputs();
+        require(
+            features.nodes.len().is_multiple_of(inputs),
+            "node_features",
+            || {
+                format!(
+                    "got {} numbers, must be rows of {inputs}",
+                    features.nodes.len()
+                )
+            },
+        )?;
+        let with_edges = self.edge_encoder.is_some();
+        for layer in &self.layers {
+            if let Some(edge) = &layer.edge {
+                check_mlp(edge, Some(3 * width))?;
+                require(edge.norm.is_some(), "networks", || {
+                    "got an edge perceptron without a LayerNorm".into()
+                })?;
+            }
+            let summands = if with_edges { 2 } else { 1 };
+            check_mlp(&layer.node, Some(summands * width))?;
+            for mlp in layer.edge.iter().chain([&layer.node]) {
+                require(mlp.outputs() == width, "networks", || {
+                    format!("got a layer of {} outputs, must be {width}", mlp.outputs())
+                })?;
+            }
+            require(layer.edge.is_some() == with_edges, "networks", || {
+                "got layers with edges and without".into()
+            })?;
+        }
+        for head in &self.heads {
+            check_mlp(head, Some(width))?;
+        }
+        match (&self.edge_encoder, features.edges) {
+            (None, None) => Ok(()),
+            (Some(encoder), Some((values, edges))) => {
+                check_mlp(encoder, None)?;
+                require(encoder.outputs() == width, "networks", || {
+                    format!("got edge latents of {}, must be {width}", encoder.outputs())
+                })?;
+                let inputs = encoder.linears[0].inputs();
+                require(
+                    values.len() == edges.senders.len() * inputs,
+                    "edge_features",
+                    || {
+                        let count = edges.senders.len();
+                        format!("got {} numbers for {count} edges of {inputs}", values.len())
+                    },
+                )?;
+                edges.check(self.node_count(features))
+            }
+            _ => Err(Error::invalid(
+                "edge_features",
+                "must be there for a network with edges, and only for one",
+            )),
+        }
+    }
+
+    pub(super) fn check_tape(
+        &self,
+        features: &Features<'_>,
+        tape: &Tape,
+        gradients: &[&[f32]],
+    ) -> Result<(), Error> {
+        let count = self.node_count(features);
+        let edges = features.edges.map_or(0, |(_, edges)| edges.senders.len());
+        let width = self.width();
+        require(
+            tape.nodes.len() == count * width
+                && tape.edges.len() == edges * width
+                && tape.layers.len() == self.layers.len()
+                && tape.heads.len() == self.heads.len(),
+            "tape",
+            || "comes from another network or other features".into(),
+        )?;
+        let fit = gradients.len() == self.heads.len()
+            && (self.heads.iter().zip(gradients))
+                .all(|(head, gradient)| gradient.len() == count * head.outputs());
+        require(fit, "gradients", || {
+            format!("must be one per head, {count} rows each")
+        })?;
+        match features.edges {
+            Some((_, edges)) => edges.check_senders(count),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Edges<'_> {
+    fn check(&self, nodes: usize) -> Result<(), Error> {
+        let count = self.senders.len();
+        let inside = |&node: &i64| (0..nodes as i64).contains(&node);
+        require(self.senders.iter().all(inside), "senders", || {
+            format!("must be nodes, 0 to {nodes} exclusive")
+        })?;
+        require(self.receivers.len() == count, "receivers", || {
+            format!("got {} of {count} edges", self.receivers.len())
+        })?;
+        check_offsets("offsets", self.offsets, nodes, count)?;
+        let sorted = self.offsets.windows(2).enumerate().all(|(node, pair)| {
+            (self.receivers[pair[0] as usize..pair[1] as usize].iter())
+                .all(|&receiver| receiver == node as i64)
+        });
+        require(sorted, "receivers", || {
+            "must be sorted, as the offsets say".into()
+        })
+    }
+
+    fn check_senders(&self, nodes: usize) -> Result<(), Error> {
+        let count = self.senders.len();
+        check_offsets("sender_offsets", self.sender_offsets, nodes, count)?;
+        let inside = |&edge: &i64| (0..count as i64).contains(&edge);
+        require(
+            self.by_sender.len() == count && self.by_sender.iter().all(inside),
+            "by_sender",
+            || format!("must list the {count} edges"),
+        )
+    }
+}
+
+fn check_offsets(
+    name: &'static str,
+    offsets: &[i64],
+    nodes: usize,
+    edges: usize,
+) -> Result<(), Error> {
+    let fit = offsets.len() == nodes + 1
+        && offsets.is_sorted()
+        && offsets[0] == 0
+        && offsets[nodes] == edges as i64;
+    require(fit, name, || {
+        format!("must rise from 0 to {edges} in {} numbers", nodes + 1)
+    })
+}
+
+/// Whether the maps fit one behind the other, and the first one `inputs` where they are given.
+fn check_mlp(mlp: &Mlp<'_>, inputs: Option<usize>) -> Result<(), Error> {
+    let mut width = inputs;
+    for linear in &mlp.linears {
+        let (weights, outputs) = (linear.weight.len(), linear.outputs());
+        require(
+            outputs > 0 && weights > 0 && weights.is_multiple_of(outputs),
+            "networks",
+            || format!("got {weights} weights for {outputs} biases"),
+        )?;
+        require(
+            width.is_none_or(|width| width == linear.inputs()),
+            "networks",
+            || {
+                format!(
+                    "got a map of {} inputs behind {width:?} outputs",
+                    linear.inputs()
+                )
+            },
+        )?;
+        width = Some(outputs);
+    }
+    require(width.is_some(), "networks", || {
+        "got a perceptron with no map".into()
+    })?;
+    let normed = mlp
+        .norm
+        .is_none_or(|norm| norm.scale.len() == mlp.outputs() && norm.shift.len() == mlp.outputs());
+    require(normed, "networks", || {
+        "got a LayerNorm of another width".into()
+    })
+}
+
+fn require(
+    holds: bool,
+    argument: &'static str,
+    problem: impl FnOnce() -> String,
+) -> Result<(), Error> {
+    if holds {
+        Ok(())
+    } else {
+        Err(Error::invalid(argument, problem()))
+    }
+}

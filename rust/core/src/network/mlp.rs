@@ -1,0 +1,307 @@
+//! Perceptrons over blocks of rows: all layers of a block while it lies in the cache.
+
+use super::buffer::Buffer;
+use super::matrix::{Matrix, Start, product};
+use super::rows;
+use std::ops::DerefMut;
+use std::sync::OnceLock;
+
+/// A linear map: `weight` row-major `[outputs, inputs]` and `bias` `[outputs]`.
+pub struct Linear<'a> {
+    pub(super) weight: &'a [f32],
+    bias: &'a [f32],
+    forward: OnceLock<Buffer>,
+    backward: OnceLock<Buffer>,
+}
+
+/// Numbers behind each row of a copied weight, so that a column's do not all fall into the same
+/// few sets of the cache.
+const GAP: usize = 16;
+
+impl<'a> Linear<'a> {
+    /// One row of `weight` and one number of `bias` per output.
+    pub fn new(weight: &'a [f32], bias: &'a [f32]) -> Self {
+        let (forward, backward) = (OnceLock::new(), OnceLock::new());
+        Self {
+            weight,
+            bias,
+            forward,
+            backward,
+        }
+    }
+
+    pub(super) fn inputs(&self) -> usize {
+        self.weight.len() / self.bias.len()
+    }
+
+    pub(super) fn outputs(&self) -> usize {
+        self.bias.len()
+    }
+
+    /// `[inputs, outputs]`, what rows are multiplied with on their way forward.
+    pub(super) fn forward(&self) -> Matrix<'_> {
+        let (inputs, outputs) = (self.inputs(), self.outputs());
+        let stride = outputs + GAP;
+        let data = self.forward.get_or_init(|| {
+            let mut data = Buffer::any(inputs * stride);
+            for (o, row) in self.weight.chunks_exact(inputs).enumerate() {
+                for (i, &x) in row.iter().enumerate() {
+                    data[i * stride + o] = x;
+                }
+            }
+            data
+        });
+        Matrix::new(data, stride).columns(0, outputs)
+    }
+
+    /// `[outputs, inputs]`, what gradients are multiplied with on their way back.
+    fn backward(&self) -> Matrix<'_> {
+        let inputs = self.inputs();
+        let stride = inputs + GAP;
+        let data = self.backward.get_or_init(|| {
+            let mut data = Buffer::any(self.outputs() * stride);
+            for (copy, row) in data
+                .chunks_exact_mut(stride)
+                .zip(self.weight.chunks_exact(inputs))
+            {
+                copy[..inputs].copy_from_slice(row);
+            }
+            data
+        });
+        Matrix::new(data, stride).columns(0, inputs)
+    }
+}
+
+/// The scale and the shift of a LayerNorm.
+#[derive(Clone, Copy)]
+pub struct Norm<'a> {
+    /// Factor of each normalized number.
+    pub scale: &'a [f32],
+    /// What is added to it.
+    pub shift: &'a [f32],
+}
+
+/// Linear maps with ReLU between them, and perhaps a LayerNorm at the end.
+pub struct Mlp<'a> {
+    /// The maps, at least one.
+    pub linears: Vec<Linear<'a>>,
+    /// The LayerNorm.
+    pub norm: Option<Norm<'a>>,
+}
+
+/// A part of a perceptron's input: contiguous rows that meet the weight's columns from `column`.
+#[derive(Clone, Copy)]
+pub(super) struct Input<'a> {
+    pub rows: &'a [f32],
+    pub width: usize,
+    pub column: usize,
+}
+
+/// What the backward pass needs of a number of rows, in memory of its own or borrowed.
+#[derive(Default)]
+pub(super) struct Kept<D = Buffer> {
+    /// After each ReLU.
+    hidden: Vec<D>,
+    /// Before the LayerNorm's scale and shift; empty without one.
+    normalized: D,
+    inverse_std: D,
+}
+
+pub(super) type KeptMut<'k> = Kept<&'k mut [f32]>;
+
+impl<'a> Mlp<'a> {
+    /// How many numbers come out per row.
+    pub fn outputs(&self) -> usize {
+        self.linears.last().map_or(0, Linear::outputs)
+    }
+
+    pub(super) fn hidden_widths(&self) -> impl Iterator<Item = usize> {
+        self.linears[..self.linears.len() - 1]
+            .iter()
+            .map(Linear::outputs)
+    }
+
+    /// How many numbers its parameters have: weights and biases in order, then scale and shift.
+    pub fn parameters(&self) -> usize {
+        let linears: usize = (self.linears.iter())
+            .map(|linear| linear.weight.len() + linear.bias.len())
+            .sum();
+        linears + self.norm.map_or(0, |norm| 2 * norm.scale.len())
+    }
+
+    pub(super) fn kept(&self, rows: usize) -> Kept {
+        let normed = if self.norm.is_some() { rows } else { 0 };
+        Kept {
+            hidden: self
+                .hidden_widths()
+                .map(|w| Buffer::any(rows * w))
+                .collect(),
+            normalized: Buffer::any(normed * self.outputs()),
+            inverse_std: Buffer::any(normed),
+        }
+    }
+
+    /// The perceptron of a block of rows, in `out` `[rows, outputs]`. `begin` is given the place of
+    /// the first map's outputs, and its bias, and says what the map is added to.
+    pub(super) fn forward(
+        &self,
+        inputs: &[Input<'_>],
+        begin: impl for<'b> FnOnce(&mut [f32], &'b [f32]) -> Start<'b>,
+        kept: &mut KeptMut<'_>,
+        out: &mut [f32],
+    ) {
+        let last = self.linears.len() - 1;
+        let mut begin = Some(begin);
+        for (i, linear) in self.linears.iter().enumerate() {
+            let (before, after) = kept.hidden.split_at_mut(i);
+            let target = match after.first_mut() {
+                Some(hidden) => &mut **hidden,
+                None if self.norm.is_some() => &mut *kept.normalized,
+                None => &mut *out,
+            };
+            let outputs = linear.outputs();
+            if let Some(begin) = begin.take() {
+                let mut start = begin(target, linear.bias);
+                for input in inputs {
+                    let rows = Matrix::new(input.rows, input.width);
+                    let weight = linear.forward().rows(input.column, input.width);
+                    product(target, outputs, start, rows, weight);
+                    start = Start::There;
+                }
+            } else {
+                let rows = Matrix::new(before[i - 1], linear.inputs());
+                let start = Start::Row(linear.bias);
+                product(target, outputs, start, rows, linear.forward());
+            }
+            if i < last {
+                rows::relu(target);
+            }
+        }
+        if let Some(norm) = self.norm {
+            rows::normalize(kept.normalized, norm.scale.len(), kept.inverse_std);
+            rows::rescale(out, kept.normalized, norm.scale, norm.shift);
+        }
+    }
+
+    /// What [`Self::forward`] gave for the rows that `kept` is of.
+    pub(super) fn outputs_again(&self, kept: &KeptMut<'_>, out: &mut [f32]) {
+        let norm = self.norm.expect("only what a LayerNorm gave is kept");
+        rows::rescale(out, kept.normalized, norm.scale, norm.shift);
+    }
+
+    /// From the gradient of the outputs of a block of `rows` rows to that of its first map's
+    /// outputs, which lies in one of the two buffers that come, both with room for the widest rows,
+    /// the gradient in the first; adds those of the parameters to `parameters`.
+    pub(super) fn backward<'g>(
+        &self,
+        inputs: &[Input<'_>],
+        kept: &KeptMut<'_>,
+        rows: usize,
+        buffers: [&'g mut [f32]; 2],
+        mut parameters: &mut [f32],
+    ) -> &'g [f32] {
+        let [mut gradient, mut spare] = buffers;
+        if let Some(norm) = self.norm {
+            let width = norm.scale.len();
+            let (linears, of_norm) = parameters.split_at_mut(parameters.len() - 2 * width);
+            let (to_scale, to_shift) = of_norm.split_at_mut(width);
+            rows::normalize_backward(
+                &mut gradient[..rows * width],
+                kept.normalized,
+                kept.inverse_std,
+                norm.scale,
+                to_scale,
+                to_shift,
+            );
+            parameters = linears;
+        }
+        for (i, linear) in self.linears.iter().enumerate().rev() {
+            let own = parameters.len() - linear.weight.len() - linear.bias.len();
+            let (others, of_linear) = parameters.split_at_mut(own);
+            let (to_weight, to_bias) = of_linear.split_at_mut(linear.weight.len());
+            parameters = others;
+            let columns = linear.inputs();
+            let after = &gradient[..rows * linear.outputs()];
+            rows::add_sum(to_bias, after);
+            let outer = Matrix::new(after, linear.outputs());
+            if i == 0 {
+                for input in inputs {
+                    let inner = Matrix::new(input.rows, input.width);
+                    let target = &mut to_weight[input.column..];
+                    product(target, columns, Start::There, outer.transposed(), inner);
+                }
+                break;
+            }
+            let activation = &*kept.hidden[i - 1];
+            let inner = Matrix::new(activation, columns);
+            product(to_weight, columns, Start::There, outer.transposed(), inner);
+            let before = &mut spare[..rows * columns];
+            product(before, columns, Start::Zero, outer, linear.backward());
+            rows::relu_backward(before, activation);
+            (gradient, spare) = (spare, gradient);
+        }
+        &gradient[..rows * self.linears[0].outputs()]
+    }
+
+    /// Adds the gradient of the first map's inputs, columns `column` to `column + width`, to `out`
+    /// `[rows, width]`.
+    pub(super) fn add_input_gradient(
+        &self,
+        gradient: &[f32],
+        column: usize,
+        width: usize,
+        out: &mut [f32],
+    ) {
+        let first = &self.linears[0];
+        let weight = first.backward().columns(column, width);
+        let outer = Matrix::new(gradient, first.outputs());
+        product(out, width, Start::There, outer, weight);
+    }
+}
+
+impl Kept {
+    /// One part after the other of its `rows` rows.
+    pub fn parts(&mut self, lengths: &[usize], rows: usize) -> Vec<KeptMut<'_>> {
+        let mut hidden: Vec<_> = (self.hidden.iter_mut())
+            .map(|hidden| split(hidden, lengths, rows).into_iter())
+            .collect();
+        split(&mut self.normalized, lengths, rows)
+            .into_iter()
+            .zip(split(&mut self.inverse_std, lengths, rows))
+            .map(|(normalized, inverse_std)| Kept {
+                hidden: hidden.iter_mut().filter_map(Iterator::next).collect(),
+                normalized,
+                inverse_std,
+            })
+            .collect()
+    }
+}
+
+impl<D: DerefMut<Target = [f32]>> Kept<D> {
+    /// The rows `first` to `first + count` of `rows`.
+    pub fn block(&mut self, first: usize, count: usize, rows: usize) -> KeptMut<'_> {
+        let part = |data| {
+            let data: &mut [f32] = data;
+            let width = data.len().checked_div(rows).unwrap_or(0);
+            &mut data[first * width..(first + count) * width]
+        };
+        Kept {
+            hidden: self.hidden.iter_mut().map(|hidden| part(hidden)).collect(),
+            normalized: part(&mut self.normalized),
+            inverse_std: part(&mut self.inverse_std),
+        }
+    }
+}
+
+/// Cuts the data of `rows` rows into parts of `lengths` rows.
+pub(super) fn split<'d>(
+    mut data: &'d mut [f32],
+    lengths: &[usize],
+    rows: usize,
+) -> Vec<&'d mut [f32]> {
+    let width = data.len().checked_div(rows).unwrap_or(0);
+    lengths
+        .iter()
+        .map(|length| data.split_off_mut(..length * width).expect("as many rows"))
+        .collect()
+}

@@ -1,0 +1,257 @@
+//! The graph network on the CPU: arrays in, arrays out.
+
+use adaptgns_core::Error;
+use adaptgns_core::network::{Edges, Features, Layer, Linear, Mlp, Network, Norm, Tape};
+use adaptgns_core::threads::Threads;
+use numpy::prelude::*;
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayDyn, PyReadonlyArrayDyn};
+use pyo3::exceptions::PyTypeError;
+use pyo3::prelude::*;
+
+use crate::arguments;
+use crate::errors::to_python;
+
+type Reals<'py> = PyReadonlyArrayDyn<'py, f32>;
+type Integers<'py> = PyReadonlyArrayDyn<'py, i64>;
+
+/// What the backward pass needs of a forward pass.
+#[pyclass(module = "adaptgns._core", frozen)]
+struct NetworkTape(std::sync::Mutex<Tape>);
+
+/// Borrowed arguments of both passes.
+struct Arguments<'py> {
+    perceptrons: Vec<Vec<Reals<'py>>>,
+    nodes: Reals<'py>,
+    edges: Option<(Reals<'py>, Vec<Integers<'py>>)>,
+    heads: usize,
+    threads: Threads,
+}
+
+impl<'py> Arguments<'py> {
+    fn new(
+        perceptrons: &Bound<'py, PyAny>,
+        nodes: &Bound<'py, PyAny>,
+        edges: Option<(Bound<'py, PyAny>, Vec<Bound<'py, PyAny>>)>,
+        heads: usize,
+        threads: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Self> {
+        let perceptrons = perceptrons
+            .try_iter()?
+            .map(|arrays| {
+                let arrays = arrays?.try_iter()?;
+                arrays.map(|array| reals("perceptrons", &array?)).collect()
+            })
+            .collect::<PyResult<_>>()?;
+        let edges = edges
+            .map(|(features, indices)| {
+                let indices = (indices.iter())
+                    .map(|array| arguments::offsets("edges", array))
+                    .collect::<PyResult<Vec<_>>>()?;
+                if !matches!(indices.len(), 3 | 5) {
+                    return Err(PyTypeError::new_err(format!(
+                        "edges: got {} arrays, must be 3, or 5 for a backward pass",
+                        indices.len()
+                    )));
+                }
+                Ok((reals("edge_features", &features)?, indices))
+            })
+            .transpose()?;
+        Ok(Self {
+            perceptrons,
+            nodes: reals("node_features", nodes)?,
+            edges,
+            heads,
+            threads: arguments::threads(threads)?,
+        })
+    }
+
+    fn features(&self) -> PyResult<Features<'_>> {
+        let edges = match &self.edges {
+            None => None,
+            Some((values, indices)) => {
+                let index = |i: usize| match indices.get(i) {
+                    Some(array) => array.as_slice(),
+                    None => Ok(&[][..]),
+                };
+                let edges = Edges {
+                    senders: index(0)?,
+                    receivers: index(1)?,
+                    offsets: index(2)?,
+                    by_sender: index(3)?,
+                    sender_offsets: index(4)?,
+                };
+                Some((values.as_slice()?, edges))
+            }
+        };
+        Ok(Features {
+            nodes: self.nodes.as_slice()?,
+            edges,
+        })
+    }
+
+    /// Encoders, steps and heads in the order in which the parameters come.
+    fn network(&self) -> PyResult<Network<'_>> {
+        let mut perceptrons = self
+            .perceptrons
+            .iter()
+            .map(|arrays| perceptron(arrays))
+            .collect::<PyResult<Vec<_>>>()?;
+        let encoders = 1 + usize::from(self.edges.is_some());
+        if perceptrons.len() < encoders + self.heads {
+            return Err(invalid(format!(
+                "got {}, must be at least {encoders} encoders and {} heads",
+                perceptrons.len(),
+                self.heads
+            )));
+        }
+        let heads = perceptrons.split_off(perceptrons.len() - self.heads);
+        let mut perceptrons = perceptrons.into_iter();
+        let node_encoder = perceptrons.next().expect("counted above");
+        let edge_encoder = self.edges.as_ref().and_then(|_| perceptrons.next());
+        let mut layers = Vec::new();
+        while let Some(first) = perceptrons.next() {
+            layers.push(if edge_encoder.is_none() {
+                Layer {
+                    edge: None,
+                    node: first,
+                }
+            } else if let Some(node) = perceptrons.next() {
+                Layer {
+                    edge: Some(first),
+                    node,
+                }
+            } else {
+                return Err(invalid(
+                    "got an edge perceptron without its node perceptron".into(),
+                ));
+            });
+        }
+        Ok(Network {
+            node_encoder,
+            edge_encoder,
+            layers,
+            heads,
+        })
+    }
+}
+
+fn invalid(problem: String) -> PyErr {
+    to_python(Error::InvalidArgument {
+        argument: "perceptrons",
+        problem,
+    })
+}
+
+fn reals<'py>(argument: &str, value: &Bound<'py, PyAny>) -> PyResult<Reals<'py>> {
+    match value.cast::<PyArrayDyn<f32>>() {
+        Ok(array) if array.is_c_contiguous() => Ok(array.try_readonly()?),
+        _ => Err(PyTypeError::new_err(format!(
+            "{argument}: must be contiguous numpy arrays of float32"
+        ))),
+    }
+}
+
+/// Weights and biases in turn, then perhaps scale and shift.
+fn perceptron<'a>(arrays: &'a [Reals<'_>]) -> PyResult<Mlp<'a>> {
+    let (pairs, rest) = arrays.as_chunks::<2>();
+    let mut mlp = Mlp {
+        linears: Vec::new(),
+        norm: None,
+    };
+    for [first, second] in pairs {
+        let (first_slice, second_slice) = (first.as_slice()?, second.as_slice()?);
+        if first.ndim() == 2 && mlp.norm.is_none() {
+            mlp.linears.push(Linear::new(first_slice, second_slice));
+        } else {
+            mlp.norm = Some(Norm {
+                scale: first_slice,
+                shift: second_slice,
+            });
+        }
+    }
+    if rest.is_empty() {
+        Ok(mlp)
+    } else {
+        Err(PyTypeError::new_err(
+            "perceptrons: must be pairs of arrays, weight and bias, at last scale and shift",
+        ))
+    }
+}
+
+type Heads<'py> = Vec<Bound<'py, PyArray2<f32>>>;
+
+/// Heads' outputs, and with `keep` the tape; `_core.pyi` has the whole contract.
+#[pyfunction]
+#[pyo3(signature = (perceptrons, node_features, edges, *, heads, keep, threads = None))]
+fn network_forward<'py>(
+    py: Python<'py>,
+    perceptrons: &Bound<'py, PyAny>,
+    node_features: &Bound<'py, PyAny>,
+    edges: Option<(Bound<'py, PyAny>, Vec<Bound<'py, PyAny>>)>,
+    heads: usize,
+    keep: bool,
+    threads: Option<&Bound<'py, PyAny>>,
+) -> PyResult<(Heads<'py>, Option<NetworkTape>)> {
+    let arguments = Arguments::new(perceptrons, node_features, edges, heads, threads)?;
+    let (network, features) = (arguments.network()?, arguments.features()?);
+    let threads = arguments.threads;
+    let (outputs, tape) = py
+        .detach(|| network.forward(features, keep, threads))
+        .map_err(to_python)?;
+    let outputs = (outputs.into_iter().zip(&network.heads))
+        .map(|(flat, head)| {
+            let rows = flat.len() / head.outputs();
+            flat.into_pyarray(py).reshape([rows, head.outputs()])
+        })
+        .collect::<PyResult<_>>()?;
+    Ok((outputs, tape.map(|tape| NetworkTape(tape.into()))))
+}
+
+type PythonGradients<'py> = (
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<f32>>,
+);
+
+/// Gradients by the parameters and the features; `_core.pyi` has the whole contract.
+#[pyfunction]
+#[pyo3(signature = (perceptrons, node_features, edges, tape, gradients, *, threads = None))]
+fn network_backward<'py>(
+    py: Python<'py>,
+    perceptrons: &Bound<'py, PyAny>,
+    node_features: &Bound<'py, PyAny>,
+    edges: Option<(Bound<'py, PyAny>, Vec<Bound<'py, PyAny>>)>,
+    tape: &NetworkTape,
+    gradients: Vec<Bound<'py, PyAny>>,
+    threads: Option<&Bound<'py, PyAny>>,
+) -> PyResult<PythonGradients<'py>> {
+    let arguments = Arguments::new(perceptrons, node_features, edges, gradients.len(), threads)?;
+    let (network, features) = (arguments.network()?, arguments.features()?);
+    let gradients = (gradients.iter())
+        .map(|array| reals("gradients", array))
+        .collect::<PyResult<Vec<_>>>()?;
+    let gradients = (gradients.iter())
+        .map(|array| Ok(array.as_slice()?))
+        .collect::<PyResult<Vec<&[f32]>>>()?;
+    let threads = arguments.threads;
+    let result = py
+        .detach(|| {
+            let mut tape = tape
+                .0
+                .lock()
+                .unwrap_or_else(std::sync::PoisonError::into_inner);
+            network.backward(features, &mut tape, &gradients, threads)
+        })
+        .map_err(to_python)?;
+    Ok((
+        result.parameters.into_pyarray(py),
+        result.nodes.into_pyarray(py),
+        result.edges.into_pyarray(py),
+    ))
+}
+
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<NetworkTape>()?;
+    module.add_function(wrap_pyfunction!(network_forward, module)?)?;
+    module.add_function(wrap_pyfunction!(network_backward, module)?)
+}
