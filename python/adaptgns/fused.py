@@ -1,7 +1,7 @@
 """The whole network in the Rust core, for float32 on the CPU.
 
-The same sums as :mod:`adaptgns.network` does with torch, in another order: block by block through
-all layers of a perceptron while the block lies in the cache, with less memory for the backward pass.
+The same sums as :mod:`adaptgns.network` does with torch, in another order: a block of rows goes
+through all layers of a perceptron while it lies in the cache, and less is kept for the way back.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class _Network(torch.autograd.Function):
         return tuple(torch.from_numpy(output) for output in outputs)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
         node_features, edge_features, *parameters = ctx.saved_tensors
         of_parameters, of_nodes, of_edges = network_backward(
@@ -99,7 +99,7 @@ class _Network(torch.autograd.Function):
             [_array(gradient) for gradient in gradients],
             threads=torch.get_num_threads(),
         )
-        parts = torch.from_numpy(of_parameters).split([p.numel() for p in parameters])
+        parts = torch.split(torch.from_numpy(of_parameters), [p.numel() for p in parameters])
         to_edges = None
         if edge_features is not None:
             to_edges = torch.from_numpy(of_edges).view_as(edge_features)

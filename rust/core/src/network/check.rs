@@ -28,18 +28,18 @@ impl Network<'_> {
         for layer in &self.layers {
             if let Some(edge) = &layer.edge {
                 check_mlp(edge, Some(3 * width))?;
-                require(edge.norm.is_some(), "networks", || {
+                require(edge.norm.is_some(), "perceptrons", || {
                     "got an edge perceptron without a LayerNorm".into()
                 })?;
             }
             let summands = if with_edges { 2 } else { 1 };
             check_mlp(&layer.node, Some(summands * width))?;
             for mlp in layer.edge.iter().chain([&layer.node]) {
-                require(mlp.outputs() == width, "networks", || {
+                require(mlp.outputs() == width, "perceptrons", || {
                     format!("got a layer of {} outputs, must be {width}", mlp.outputs())
                 })?;
             }
-            require(layer.edge.is_some() == with_edges, "networks", || {
+            require(layer.edge.is_some() == with_edges, "perceptrons", || {
                 "got layers with edges and without".into()
             })?;
         }
@@ -50,7 +50,7 @@ impl Network<'_> {
             (None, None) => Ok(()),
             (Some(encoder), Some((values, edges))) => {
                 check_mlp(encoder, None)?;
-                require(encoder.outputs() == width, "networks", || {
+                require(encoder.outputs() == width, "perceptrons", || {
                     format!("got edge latents of {}, must be {width}", encoder.outputs())
                 })?;
                 let inputs = encoder.linears[0].inputs();
@@ -155,12 +155,12 @@ fn check_mlp(mlp: &Mlp<'_>, inputs: Option<usize>) -> Result<(), Error> {
         let (weights, outputs) = (linear.weight.len(), linear.outputs());
         require(
             outputs > 0 && weights > 0 && weights.is_multiple_of(outputs),
-            "networks",
+            "perceptrons",
             || format!("got {weights} weights for {outputs} biases"),
         )?;
         require(
             width.is_none_or(|width| width == linear.inputs()),
-            "networks",
+            "perceptrons",
             || {
                 format!(
                     "got a map of {} inputs behind {width:?} outputs",
@@ -170,13 +170,13 @@ fn check_mlp(mlp: &Mlp<'_>, inputs: Option<usize>) -> Result<(), Error> {
         )?;
         width = Some(outputs);
     }
-    require(width.is_some(), "networks", || {
+    require(width.is_some(), "perceptrons", || {
         "got a perceptron with no map".into()
     })?;
     let normed = mlp
         .norm
         .is_none_or(|norm| norm.scale.len() == mlp.outputs() && norm.shift.len() == mlp.outputs());
-    require(normed, "networks", || {
+    require(normed, "perceptrons", || {
         "got a LayerNorm of another width".into()
     })
 }

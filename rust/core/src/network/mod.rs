@@ -54,20 +54,19 @@ pub struct Network<'a> {
     pub heads: Vec<Mlp<'a>>,
 }
 
-/// Edges sorted by receiver. `senders` and `receivers` hold a node per edge; those into node i
-/// are `offsets[i]..offsets[i + 1]`. `by_sender` lists the edges sorted by sender, and
-/// `sender_offsets` delimits each sender's; both may be empty if nothing goes backward.
+/// Edges sorted by receiver.
 #[derive(Clone, Copy)]
 pub struct Edges<'a> {
-    #[allow(missing_docs)]
+    /// The node that each edge comes from.
     pub senders: &'a [i64],
-    #[allow(missing_docs)]
+    /// The node that each edge goes to.
     pub receivers: &'a [i64],
-    #[allow(missing_docs)]
+    /// Node `i` receives the edges `offsets[i]..offsets[i + 1]`.
     pub offsets: &'a [i64],
-    #[allow(missing_docs)]
+    /// The edges sorted by sender; may be empty if nothing goes backward.
     pub by_sender: &'a [i64],
-    #[allow(missing_docs)]
+    /// Node `i` sends the edges that `by_sender` lists from `sender_offsets[i]` to
+    /// `sender_offsets[i + 1]`; may be empty if nothing goes backward.
     pub sender_offsets: &'a [i64],
 }
 
@@ -780,4 +779,171 @@ fn total(sums: Vec<Buffer>) -> Buffer {
         rows::add(&mut total, &sum);
     }
     total
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::rows::{MOST, Processor};
+    use super::*;
+
+    /// Numbers from -1 to 1 that follow from the seed.
+    fn numbers(seed: u64, count: usize) -> Vec<f32> {
+        let mut state = seed.wrapping_mul(2).wrapping_add(1);
+        (0..count)
+            .map(|_| {
+                state = state
+                    .wrapping_mul(6_364_136_223_846_793_005)
+                    .wrapping_add(1);
+                (state >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+            })
+            .collect()
+    }
+
+    proptest! {
+        #[test]
+        fn products_are_sums_of_products(
+            rows in 0usize..21, inner in 0usize..9, columns in 1usize..75, gap in 0usize..3,
+            transposed: bool, start in 0usize..3, kind in 0usize..3, seed: u64,
+        ) {
+            let most = [Processor::Plain, Processor::V3, Processor::V4][kind];
+            MOST.set(most);
+            let left = numbers(seed, rows * inner);
+            let right = numbers(seed ^ 1, inner * columns);
+            let row = numbers(seed ^ 2, columns);
+            let stride = columns + gap;
+            let before = numbers(seed ^ 3, rows * stride);
+            let mut out = before.clone();
+            let a = if transposed {
+                Matrix::new(&left, rows.max(1)).transposed()
+            } else {
+                Matrix::new(&left, inner.max(1))
+            };
+            let start = [Start::There, Start::Zero, Start::Row(&row)][start];
+            if rows > 0 && inner > 0 {
+                product(&mut out, stride, start, a, Matrix::new(&right, columns));
+            }
+            for i in 0..rows {
+                for j in 0..stride {
+                    let was = f64::from(before[i * stride + j]);
+                    let mut expected = was;
+                    if inner > 0 && j < columns {
+                        expected = match start {
+                            Start::There => was,
+                            Start::Zero => 0.0,
+                            Start::Row(row) => f64::from(row[j]),
+                        };
+                        for k in 0..inner {
+                            let place = if transposed { k * rows + i } else { i * inner + k };
+                            expected += f64::from(left[place]) * f64::from(right[k * columns + j]);
+                        }
+                    }
+                    prop_assert!((f64::from(out[i * stride + j]) - expected).abs() < 1e-5);
+                }
+            }
+            MOST.set(Processor::V4);
+        }
+    }
+
+    /// A network of two steps on a ring of `nodes`, and the sum of its head's outputs.
+    fn ring(nodes: usize, width: usize, threads: Threads) -> (Vec<f32>, Vec<f32>) {
+        let ends: Vec<i64> = (0..nodes as i64).collect();
+        let senders: Vec<i64> = ends.iter().map(|i| (i + 1) % nodes as i64).collect();
+        let offsets: Vec<i64> = (0..=nodes as i64).collect();
+        let by_sender: Vec<i64> = ends
+            .iter()
+            .map(|i| (i + nodes as i64 - 1) % nodes as i64)
+            .collect();
+        let sizes = [
+            [3, width, width],
+            [2, width, width],
+            [3 * width, width, width],
+            [2 * width, width, width],
+            [3 * width, width, width],
+            [2 * width, width, width],
+            [width, width, 2],
+        ];
+        let data: Vec<Vec<Vec<f32>>> = (sizes.iter().enumerate())
+            .map(|(i, sizes)| {
+                let seed = 100 * i as u64;
+                let [first, middle, last] = *sizes;
+                vec![
+                    numbers(seed, first * middle),
+                    numbers(seed + 1, middle),
+                    numbers(seed + 2, middle * last),
+                    numbers(seed + 3, last),
+                    numbers(seed + 4, last),
+                    numbers(seed + 5, last),
+                ]
+            })
+            .collect();
+        let mut mlps = data.iter().enumerate().map(|(i, data)| Mlp {
+            linears: vec![
+                Linear::new(&data[0], &data[1]),
+                Linear::new(&data[2], &data[3]),
+            ],
+            norm: (i < 6).then(|| Norm {
+                scale: &data[4],
+                shift: &data[5],
+            }),
+        });
+        let mut next = || mlps.next().expect("as many as sizes");
+        let network = Network {
+            node_encoder: next(),
+            edge_encoder: Some(next()),
+            layers: (0..2)
+                .map(|_| Layer {
+                    edge: Some(next()),
+                    node: next(),
+                })
+                .collect(),
+            heads: vec![next()],
+        };
+        let (node_features, edge_features) = (numbers(7, nodes * 3), numbers(8, nodes * 2));
+        let features = Features {
+            nodes: &node_features,
+            edges: Some((
+                &edge_features,
+                Edges {
+                    senders: &senders,
+                    receivers: &ends,
+                    offsets: &offsets,
+                    by_sender: &by_sender,
+                    sender_offsets: &offsets,
+                },
+            )),
+        };
+        let (out, tape) = network.forward(features, true, threads).unwrap();
+        let ones = vec![1.0; out[0].len()];
+        let mut tape = tape.unwrap();
+        let gradients = network
+            .backward(features, &mut tape, &[&ones], threads)
+            .unwrap();
+        let all = [gradients.parameters, gradients.nodes, gradients.edges].concat();
+        (out.concat(), all)
+    }
+
+    #[test]
+    fn any_number_of_threads_gives_the_same_bits() {
+        let one = Threads::AtMost(std::num::NonZeroUsize::MIN);
+        assert!(ring(1_000, 16, one) == ring(1_000, 16, Threads::All));
+    }
+
+    #[test]
+    fn every_kind_of_processor_gives_the_same() {
+        let one = Threads::AtMost(std::num::NonZeroUsize::MIN);
+        let best = ring(300, 20, one);
+        for most in [Processor::Plain, Processor::V3] {
+            MOST.set(most);
+            let other = ring(300, 20, one);
+            MOST.set(Processor::V4);
+            for (best, other) in [(&best.0, &other.0), (&best.1, &other.1)] {
+                let norm =
+                    |values: &mut dyn Iterator<Item = f32>| values.map(|x| x * x).sum::<f32>();
+                let off = norm(&mut best.iter().zip(other).map(|(a, b)| a - b));
+                assert!(off < 1e-8 * norm(&mut best.iter().copied()), "{most:?}");
+            }
+        }
+    }
 }

@@ -22,17 +22,12 @@ macro_rules! vectorized {
                 fn v4($($argument: $kind),*) { $wide }
                 #[target_feature(enable = "avx2,fma")]
                 fn v3($($argument: $kind),*) { $middle }
-                if is_x86_feature_detected!("avx512f")
-                    && is_x86_feature_detected!("avx512vl")
-                    && is_x86_feature_detected!("avx512bw")
-                    && is_x86_feature_detected!("avx512dq")
-                {
-                    // SAFETY: the processor has them; AVX-512 comes with AVX2 and FMA.
-                    return unsafe { v4($($argument),*) };
-                }
-                if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+                match $crate::network::rows::processor() {
                     // SAFETY: the processor has them.
-                    return unsafe { v3($($argument),*) };
+                    $crate::network::rows::Processor::V4 => return unsafe { v4($($argument),*) },
+                    // SAFETY: the processor has them.
+                    $crate::network::rows::Processor::V3 => return unsafe { v3($($argument),*) },
+                    $crate::network::rows::Processor::Plain => {}
                 }
             }
             $narrow
@@ -40,6 +35,42 @@ macro_rules! vectorized {
     };
 }
 pub(super) use vectorized;
+
+/// What a processor has, the least first: nothing that needs asking, AVX2 with FMA, AVX-512.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Processor {
+    Plain,
+    V3,
+    V4,
+}
+
+#[cfg(test)]
+thread_local! {
+    /// The most that this thread uses of its processor.
+    pub(super) static MOST: std::cell::Cell<Processor> = const { std::cell::Cell::new(Processor::V4) };
+}
+
+/// The processor at hand.
+#[cfg(target_arch = "x86_64")]
+pub(super) fn processor() -> Processor {
+    let v3 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+    let v4 = v3
+        && is_x86_feature_detected!("avx512f")
+        && is_x86_feature_detected!("avx512vl")
+        && is_x86_feature_detected!("avx512bw")
+        && is_x86_feature_detected!("avx512dq");
+    let most = if v4 {
+        Processor::V4
+    } else if v3 {
+        Processor::V3
+    } else {
+        Processor::Plain
+    };
+    #[cfg(test)]
+    return most.min(MOST.get());
+    #[cfg(not(test))]
+    most
+}
 
 /// What is added to the variance under a LayerNorm's root, torch's default.
 const EPSILON: f32 = 1e-5;

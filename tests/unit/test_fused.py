@@ -1,0 +1,224 @@
+"""The network in the Rust core against the same network in torch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from adaptgns import fused
+from adaptgns._core import network_backward, network_forward
+from adaptgns.network import EncodeProcessDecode
+from adaptgns.segment import Graph
+
+
+def graph_of(rng: np.random.Generator, nodes: int, edges: int, *, hub: int = 0) -> Graph:
+    """Any directed multigraph; ``hub`` more edges go to the first node."""
+    pairs = rng.integers(0, nodes, (edges + hub, 2))
+    pairs[edges:, 1] = 0
+    pairs = pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))]
+    offsets = np.searchsorted(pairs[:, 1], np.arange(nodes + 1))
+    return Graph.from_numpy(np.ascontiguousarray(pairs.T), offsets)
+
+
+class Case:
+    """A network with random parameters, and what it sees."""
+
+    def __init__(
+        self,
+        nodes: int = 30,
+        edges: int = 90,
+        *,
+        hub: int = 0,
+        latent: int = 16,
+        hidden_layers: int = 1,
+        steps: int = 2,
+        with_edges: bool = True,
+        variance: bool = True,
+    ) -> None:
+        torch.manual_seed(0)
+        rng = np.random.default_rng(0)
+        self.network = EncodeProcessDecode(
+            7,
+            3,
+            2,
+            latent=latent,
+            hidden_layers=hidden_layers,
+            steps=steps,
+            edges=with_edges,
+            variance=variance,
+        )
+        for parameter in self.network.parameters():  # LayerNorms begin with ones and zeros
+            parameter.data += 0.1 * torch.randn_like(parameter)
+        self.graph = graph_of(rng, nodes, edges, hub=hub) if with_edges else None
+        self.node_features = torch.randn(nodes, 7)
+        self.edge_features = torch.randn(edges + hub, 3) if with_edges else None
+
+    def run(self, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+        """Outputs, then gradients of a function of them by features and parameters."""
+        self.network.to(dtype).zero_grad()
+        features = [
+            f.to(dtype, copy=True).requires_grad_()
+            for f in (self.node_features, self.edge_features)
+            if f is not None
+        ]
+        prediction = self.network(features[0], (*features, None)[1], self.graph)
+        outputs = [part for part in prediction if part is not None]
+        torch.stack([(out * out.sin()).mean() for out in outputs]).sum().backward()
+        self.network.to(torch.float32)
+        leaves = [*features, *self.network.parameters()]
+        return [out.detach() for out in outputs] + [
+            leaf.grad.to(dtype, copy=True) for leaf in leaves
+        ]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {},
+        {"hidden_layers": 2, "steps": 3},
+        {"latent": 20, "nodes": 300, "edges": 1_500},
+        {"nodes": 1, "edges": 2},
+        {"edges": 0},
+        {"hub": 700},
+        {"variance": False},
+        {"with_edges": False},
+        {"latent": 1, "hidden_layers": 0},
+    ],
+    ids=str,
+)
+def test_equals_torch_in_double_precision(case: dict[str, int]) -> None:
+    made = Case(**case)
+    ours, theirs = made.run(), made.run(torch.float64)
+
+    assert len(ours) == len(theirs)
+    for own, reference in zip(ours, theirs, strict=True):
+        assert own.dtype == torch.float32
+        error = (own.double() - reference).norm()
+        assert error <= 1e-5 * reference.norm() + 1e-7
+
+
+def test_torch_does_it_in_double_precision_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The comparison above compares two things."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise RuntimeError("the Rust core was asked")
+
+    monkeypatch.setattr(fused, "network", refuse)
+    made = Case()
+    made.run(torch.float64)
+    with pytest.raises(RuntimeError, match="Rust core"):
+        made.run()
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    made = Case(nodes=700, edges=4_000)
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            results.append(made.run())
+    finally:
+        torch.set_num_threads(before)
+    for one, three in zip(*results, strict=True):
+        assert torch.equal(one, three)
+
+
+def test_inference_equals_training_and_needs_no_edges_by_sender() -> None:
+    made = Case()
+    trained = made.run()
+    assert made.graph is not None
+    senders, receivers, offsets = list(vars(made.graph).values())[:3]
+    with torch.inference_mode():
+        seen = made.network(
+            made.node_features, made.edge_features, Graph(senders, receivers, offsets)
+        )
+    assert torch.equal(seen.acceleration, trained[0])
+    assert torch.equal(seen.variance, trained[1])
+
+
+def test_gradients_can_be_taken_twice_of_one_pass() -> None:
+    made = Case()
+    out = made.network(made.node_features, made.edge_features, made.graph).acceleration.sum()
+    parameters = list(made.network.decoder.parameters()) + list(made.network.layers[0].parameters())
+    first = torch.autograd.grad(out, parameters, retain_graph=True)
+    second = torch.autograd.grad(out, parameters)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_nan_surfaces() -> None:
+    made = Case()
+    made.node_features[3] = torch.nan
+    assert made.run()[0].isnan().any()
+
+
+def linear(outputs: int, inputs: int) -> list[np.ndarray]:
+    return [np.zeros((outputs, inputs), np.float32), np.zeros(outputs, np.float32)]
+
+
+def norm(width: int) -> list[np.ndarray]:
+    return [np.ones(width, np.float32), np.zeros(width, np.float32)]
+
+
+GOOD = [
+    [*linear(4, 3), *norm(4)],  # node encoder
+    [*linear(4, 2), *norm(4)],  # edge encoder
+    [*linear(4, 12), *norm(4)],  # edge
+    [*linear(4, 8), *norm(4)],  # node
+    linear(2, 4),  # head
+]
+NODES = np.zeros((2, 3), np.float32)
+INDEX = [np.array([1]), np.array([0]), np.array([0, 1, 1])]
+EDGES = (np.zeros((1, 2), np.float32), INDEX)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "message"),
+    [
+        ({"node_features": np.zeros((2, 3))}, TypeError, "node_features: .* float32"),
+        ({"node_features": np.zeros(5, np.float32)}, ValueError, "node_features: .* rows of 3"),
+        ({"edges": (np.zeros((2, 2), np.float32), INDEX)}, ValueError, "edge_features: .* 1 edges"),
+        ({"edges": None}, ValueError, "perceptrons"),
+        ({"edges": (EDGES[0], INDEX[:2])}, TypeError, "edges: got 2 arrays, must be 3"),
+        ({"edges": (EDGES[0], [np.array([2]), *INDEX[1:]])}, ValueError, "senders: must be nodes"),
+        ({"edges": (EDGES[0], [*INDEX[:2], np.array([0, 0, 1])])}, ValueError, "receivers: .*sort"),
+        ({"edges": (EDGES[0], [*INDEX[:2], np.array([0, 2, 1])])}, ValueError, "offsets: .* rise"),
+        ({"perceptrons": GOOD[:2]}, ValueError, "perceptrons: got 2, must be at least 2"),
+        ({"perceptrons": GOOD[:3] + GOOD[4:]}, ValueError, "without its node perceptron"),
+        ({"perceptrons": [*GOOD[:4], linear(2, 5)]}, ValueError, "a map of 5 inputs"),
+        ({"perceptrons": [*GOOD[:4], linear(2, 4)[:1]]}, TypeError, "pairs of arrays"),
+        ({"threads": 0}, ValueError, "threads: got 0"),
+    ],
+)
+def test_what_does_not_fit_is_refused(change: dict, kind: type[Exception], message: str) -> None:
+    arguments = {
+        "perceptrons": GOOD,
+        "node_features": NODES,
+        "edges": EDGES,
+        "heads": 1,
+        "keep": False,
+    }
+    network_forward(**arguments)
+    with pytest.raises(kind, match=message):
+        network_forward(**(arguments | change))
+
+
+def test_a_tape_goes_with_its_own_pass() -> None:
+    _, tape = network_forward(GOOD, NODES, EDGES, heads=1, keep=True)
+    ones = np.ones((2, 2), np.float32)
+    with pytest.raises(ValueError, match="sender_offsets: must rise from 0 to 1 in 3 numbers"):
+        network_backward(GOOD, NODES, EDGES, tape, [ones])
+    backward = (EDGES[0], [*INDEX, np.array([0]), np.array([0, 0, 1])])
+    network_backward(GOOD, NODES, backward, tape, [ones])
+    with pytest.raises(ValueError, match=r"gradients: must be one per head, 2 rows each"):
+        network_backward(GOOD, NODES, backward, tape, [ones[:1]])
+    with pytest.raises(ValueError, match="tape: comes from another network"):
+        network_backward(
+            GOOD,
+            np.zeros((3, 3), np.float32),
+            (EDGES[0], [*INDEX[:2], np.array([0, 1, 1, 1]), np.array([0]), np.array([0, 0, 1, 1])]),
+            tape,
+            [ones],
+        )
