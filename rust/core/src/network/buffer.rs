@@ -18,8 +18,15 @@ impl Buffer {
         // Where the lock is held, or was when the process forked, memory comes fresh.
         let waiting = FREE.try_lock().ok().and_then(|mut free| {
             let fits = |data: &Vec<f32>| (length..=length + length / 2).contains(&data.capacity());
-            let place = free.iter().rposition(fits)?;
-            Some(free.swap_remove(place))
+            if let Some(place) = free.iter().rposition(fits) {
+                return Some(free.remove(place));
+            }
+            // What waits longest is of a size that nobody asks for.
+            let mut freed = 0;
+            while freed < length && !free.is_empty() {
+                freed += free.remove(0).capacity();
+            }
+            None
         });
         // Graphs of one simulation have about as many edges from step to step.
         let mut data = waiting.unwrap_or_else(|| Vec::with_capacity(length + length / 8));
