@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -37,6 +38,7 @@ from adaptgns.graph import adaptive_graph, radius_graph
 from adaptgns.interruption import interruption
 from adaptgns.losses import training_loss
 from adaptgns.network import Prediction
+from adaptgns.processes import ALONE, Processes
 from adaptgns.rollout import to_sigma
 from adaptgns.segment import Graph
 from adaptgns.validation import validate
@@ -69,13 +71,20 @@ class Trainer:
         train: Trajectories,
         valid: Trajectories | None,
         checkpoint: Checkpoint | None = None,
+        processes: Processes = ALONE,
     ) -> None:
         if config.graph == "adaptive" and (config.loss == "mse" or not config.model.edges):
             raise ValueError(
                 "graph: adaptive needs a model with edges and a variance; got the loss "
                 f"{config.loss} and model.edges {config.model.edges}"
             )
+        if config.batch < processes.count:
+            raise ValueError(
+                f"batch: got {config.batch} samples a step for {processes.count} processes; "
+                "accepted is at least one each"
+            )
         self.config, self.metadata, self.folder, self.valid = config, metadata, folder, valid
+        self.processes = processes
         self.device = torch_device(config.device)
         torch.manual_seed(config.seed)
         self.simulator = build_simulator(config, metadata).to(self.device)
@@ -131,7 +140,8 @@ class Trainer:
         """
         if not all(p.isfinite().all() for p in self.simulator.parameters()):
             raise self._diverged("the weights became infinite or NaN")
-        write_checkpoint(self.folder / LAST, self.checkpoint(resumable=True))
+        if self.processes.first:
+            write_checkpoint(self.folder / LAST, self.checkpoint(resumable=True))
 
     def run(self, console: Console) -> None:
         """Train to the last step.
@@ -141,7 +151,14 @@ class Trainer:
         """
         config = self.config
         batches = iter(
-            training_batches(self.windows, config, self.step, pin=self.device.type == "cuda")
+            training_batches(
+                self.windows,
+                config,
+                self.step,
+                pin=self.device.type == "cuda",
+                rank=self.processes.rank,
+                processes=self.processes.count,
+            )
         )
         progress = Progress(
             TextColumn("training"),
@@ -155,8 +172,8 @@ class Trainer:
         self.simulator.train()
         losses: list[Tensor] = []
         with (
-            Log(self.folder, self.step) as log,
-            interruption() as interrupted,
+            Log(self.folder, self.step) if self.processes.first else nullcontext() as log,
+            interruption(insistent=self.processes.count == 1) as interrupted,
             progress,
         ):
             task = progress.add_task(
@@ -164,42 +181,63 @@ class Trainer:
             )
             logged = time.perf_counter()
             while self.step < config.steps:
-                losses.append(self.train_step(next(batches).to(self.device)))
+                batch = next(batches)
+                losses.append(self.train_step(None if batch is None else batch.to(self.device)))
                 self.step += 1
                 progress.advance(task)
                 last = self.step == config.steps
+                # Several processes stop at one step, which they agree on now and then.
+                agree = self.processes.count == 1 or self.step % SHOW_EVERY == 0
+                stop = agree and self.processes.any(bool(interrupted))
                 if self.step % SHOW_EVERY == 0 or last:
                     loss = float(torch.stack(losses).mean())
                     speed = len(losses) / (time.perf_counter() - logged)
                     progress.update(task, loss=f"{loss:.4g}", speed=f"{speed:.1f}")
                 if self.step % LOG_EVERY == 0 or last:
-                    log.write(
-                        self.step,
-                        {
-                            "loss": self._mean_loss(losses),
-                            "lr": self.learning_rate(),
-                            "steps_per_second": speed,
-                        },
-                    )
+                    mean = self._mean_loss(losses)
+                    if log is not None:
+                        values = {"lr": self.learning_rate(), "steps_per_second": speed}
+                        log.write(self.step, {"loss": mean, **values})
                     losses.clear()
                     logged = time.perf_counter()
                 if self.valid is not None and (self.step % config.validate_every == 0 or last):
                     self._mean_loss(losses)
-                    self._validate(log)
+                    if log is not None:
+                        self._validate(log)
+                    self.processes.wait()
                     logged = time.perf_counter()
-                if self.step % config.checkpoint_every == 0 or last or interrupted:
+                if self.step % config.checkpoint_every == 0 or last or stop:
                     self._mean_loss(losses)
                     self.save()
-                if interrupted and not last:
+                if stop and not last:
+                    signals = interrupted or ["a signal to another process"]
                     raise TrainingStopped(
-                        f"stopped by {interrupted[0]} after step {self.step}; nothing is lost. "
+                        f"stopped by {signals[0]} after step {self.step}; nothing is lost. "
                         f"Go on with\n  python -m adaptgns.train --resume {self.folder}"
                     )
 
-    def train_step(self, batch: Batch) -> Tensor:
-        """One optimizer step on ``batch``; the loss before it."""
+    def train_step(self, batch: Batch | None) -> Tensor:
+        """One optimizer step on ``batch``, this process's share of it, None where that is nothing;
+        the loss of the whole batch before the step."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate()
+        self.optimizer.zero_grad()
+        loss = None
+        if batch is not None:
+            loss = self._loss(batch)
+            loss.backward()  # type: ignore[no-untyped-call]
+        if self.processes.count > 1:
+            particles = 0 if batch is None else int(batch.mobile.sum())
+            parameters = self.simulator.parameters()
+            loss = self.processes.mean_gradients(parameters, loss, particles)
+        assert loss is not None, "one process alone has all samples"
+        if self.config.clip is not None:
+            torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), self.config.clip)
+        self.optimizer.step()
+        return loss.detach()
+
+    def _loss(self, batch: Batch) -> Tensor:
+        """The mean loss of ``batch`` over particles and frames."""
         window, graph, variance = batch.window, self._first_graph(batch), None
         unrolled = batch.following if 2 * self.step >= self.config.steps else batch.following[:, :1]
         losses: list[Tensor] = []
@@ -215,13 +253,7 @@ class Trainer:
                 position = torch.where(batch.mobile[:, None], position, following)
                 window = torch.cat([window[:, 1:], position[:, None]], dim=1)
                 graph = self._graph(batch, window, prediction)
-        loss = torch.stack(losses).mean()
-        self.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        if self.config.clip is not None:
-            torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), self.config.clip)
-        self.optimizer.step()
-        return loss.detach()
+        return torch.stack(losses).mean()
 
     def learning_rate(self) -> float:
         """The learning rate of the current step."""

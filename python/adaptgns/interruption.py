@@ -11,13 +11,14 @@ from typing import Any
 
 
 @contextmanager
-def interruption() -> Iterator[list[str]]:
+def interruption(*, insistent: bool = True) -> Iterator[list[str]]:
     """A list that stays empty until SIGINT or SIGTERM arrives, which then names the signal.
 
     The work looks at it where it can stop: an exception out of a signal handler can surface
     anywhere, and is lost where it does so in a destructor or a callback of a C library. A second
-    signal acts as it would have without this. Threads other than the main one get no signals, and
-    here an empty list.
+    signal acts as it would have without this, unless not ``insistent``: a launcher of several
+    processes hands on what the terminal has sent them already. Threads other than the main one get
+    no signals, and here an empty list.
     """
     received: list[str] = []
     if threading.current_thread() is not threading.main_thread():
@@ -27,7 +28,8 @@ def interruption() -> Iterator[list[str]]:
 
     def note(number: int, _: FrameType | None) -> None:
         received.append(signal.Signals(number).name)
-        signal.signal(number, previous[number])
+        if insistent:
+            signal.signal(number, previous[number])
 
     for number in (signal.SIGINT, signal.SIGTERM):
         previous[number] = signal.signal(number, note)

@@ -24,6 +24,7 @@ from adaptgns.evaluate import evaluate
 from adaptgns.fit import Trainer, TrainingStopped
 from adaptgns.plot import animate
 from adaptgns.presets import PRESETS
+from adaptgns.processes import Processes, processes
 from adaptgns.rollout import write_rollouts
 
 CONFIG = "config.json"
@@ -34,10 +35,26 @@ def main(argv: Sequence[str] | None = None) -> None:
     console = Console()
     with plain_errors(torch.OutOfMemoryError):
         config = parse(sys.argv[1:] if argv is None else list(argv))
+        with processes(config.device) as group:
+            own = console if group.first else Console(quiet=True)
+            try:
+                folder, data = train(config, own, group)
+            except TrainingStopped as stopped:
+                if group.first:
+                    console.print(str(stopped), markup=False)
+                else:  # of what the first may not have met
+                    print(f"process {group.rank}: {stopped}", file=sys.stderr)
+                raise SystemExit(1) from None
+        if not group.first:
+            return
         try:
-            train(config, console)
-        except TrainingStopped as stopped:
-            console.print(str(stopped), markup=False)
+            report(folder, data, config, console)
+        except KeyboardInterrupt:
+            console.print(
+                "stopped in the rollouts; the training is saved. Repeat them with\n"
+                f"  python -m adaptgns.train --resume {folder}",
+                markup=False,
+            )
             raise SystemExit(1) from None
 
 
@@ -79,12 +96,16 @@ def _take(arguments: list[str], option: str) -> tuple[str | None, list[str]]:
     return None, arguments
 
 
-def train(config: TrainConfig, console: Console) -> Path:
-    """Train by ``config`` and report on the test split; the run folder."""
-    folder = run_folder(config)
+def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path, Path]:
+    """Train by ``config``, as one of the processes of ``group``; the run folder and that of the
+    data."""
+    folder = group.same(run_folder(config))
     checkpoint = None if config.resume is None else read_checkpoint(config.resume / LAST)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
+    if group.first:  # who makes or completes what the others read
+        read_metadata(dataset_folder(config.data))
+    group.wait()
     data = dataset_folder(config.data)
     metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
     train_split, valid_split, test_split = (
@@ -93,9 +114,16 @@ def train(config: TrainConfig, console: Console) -> Path:
     for split in (train_split, valid_split, test_split):  # before anything depends on them
         check_split(split, metadata)
     trainer = Trainer(
-        config, metadata, folder, train=train_split, valid=valid_split, checkpoint=checkpoint
+        config,
+        metadata,
+        folder,
+        train=train_split,
+        valid=valid_split,
+        checkpoint=checkpoint,
+        processes=group,
     )
-    replace_text(folder / CONFIG, json.dumps(to_json(config), indent=1))
+    if group.first:
+        replace_text(folder / CONFIG, json.dumps(to_json(config), indent=1))
     console.print(
         f"training on {data}: {len(trainer.windows):,} windows, "
         f"{sum(p.numel() for p in trainer.simulator.parameters()):,} parameters, "
@@ -105,14 +133,7 @@ def train(config: TrainConfig, console: Console) -> Path:
     if config.data not in EMBEDDED and checkpoint is None:
         _tell_assumptions(config, console)
     trainer.run(console)
-    try:
-        report(folder, data, config, console)
-    except KeyboardInterrupt:
-        raise TrainingStopped(
-            f"stopped in the rollouts; the training is saved. Repeat them with\n"
-            f"  python -m adaptgns.train --resume {folder}"
-        ) from None
-    return folder
+    return folder, data
 
 
 def _tell_assumptions(config: TrainConfig, console: Console) -> None:

@@ -164,6 +164,10 @@ class Windows(Dataset[Sample]):
             positions += displacement
             following += answers
 
+    def collate_share(self, samples: Sequence[Sample]) -> Batch | None:
+        """:meth:`collate` of what may be no samples, which give None."""
+        return self.collate(samples) if samples else None
+
     def collate(self, samples: Sequence[Sample]) -> Batch:
         """One batch with its base graph, built on the noisy positions."""
         frames = np.concatenate([s.positions for s in samples], axis=1)
@@ -198,7 +202,8 @@ class ShuffledKeys(Sampler[list[Key]]):
 
     Windows come epoch after epoch, each a permutation drawn from (seed, epoch); none is left out,
     and a batch may straddle two epochs. A batch takes ``batch`` windows, or fewer where the next
-    one would exceed ``most`` particles. ``particles`` ``[n]`` counts those of each window.
+    one would exceed ``most`` particles. ``particles`` ``[n]`` counts those of each window. Of every
+    batch's keys this process takes number ``rank`` and every ``processes``-th after it.
     """
 
     def __init__(
@@ -210,16 +215,19 @@ class ShuffledKeys(Sampler[list[Key]]):
         seed: int,
         first: int,
         last: int,
+        rank: int = 0,
+        processes: int = 1,
     ) -> None:
         self.particles, self.batch, self.seed = particles, batch, seed
         self.most = np.inf if most is None else most
         self.first, self.last = first, last
+        self.share = slice(rank, None, processes)
 
     def __len__(self) -> int:
         return self.last - self.first
 
     def __iter__(self) -> Iterator[list[Key]]:
-        return islice(self._batches(), self.first, self.last)
+        return (keys[self.share] for keys in islice(self._batches(), self.first, self.last))
 
     def _batches(self) -> Iterator[list[Key]]:
         keys: list[Key] = []
@@ -236,9 +244,16 @@ class ShuffledKeys(Sampler[list[Key]]):
 
 
 def training_batches(
-    windows: Windows, config: TrainConfig, first: int, *, pin: bool
+    windows: Windows,
+    config: TrainConfig,
+    first: int,
+    *,
+    pin: bool,
+    rank: int = 0,
+    processes: int = 1,
 ) -> DataLoader[Sample]:
-    """The batches of steps ``first`` to ``config.steps``, one :class:`Batch` each."""
+    """The batches of steps ``first`` to ``config.steps``, of each this process's share, as
+    :class:`Batch`, None where that is empty."""
     keys = ShuffledKeys(
         windows.particles,
         batch=config.batch,
@@ -246,12 +261,14 @@ def training_batches(
         seed=config.seed,
         first=first,
         last=config.steps,
+        rank=rank,
+        processes=processes,
     )
     return DataLoader(
         windows,
         batch_sampler=keys,
         num_workers=config.workers,
-        collate_fn=windows.collate,
+        collate_fn=windows.collate_share,
         pin_memory=pin,
         worker_init_fn=_leave_interrupts_to_the_parent,
     )

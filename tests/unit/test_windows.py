@@ -194,3 +194,15 @@ def test_drift_is_shared_and_leaves_the_last_velocity(
     assert np.array_equal(drifted[-3:], clean[-3:])
     assert (np.abs(difference[:-3]).max((1, 2)) > 1e-5).all()
     np.testing.assert_allclose(difference, difference[:, :1].repeat(len(clean[0]), 1), atol=1e-6)
+
+
+def test_processes_share_every_batch() -> None:
+    sizes = np.full(50, 10)
+    alone = ShuffledKeys(sizes, batch=5, most=None, seed=3, first=2, last=15)
+    shares = [
+        ShuffledKeys(sizes, batch=5, most=None, seed=3, first=2, last=15, rank=rank, processes=7)
+        for rank in range(7)
+    ]
+    for whole, *parts in zip(alone, *shares, strict=True):
+        assert sorted(whole) == sorted(key for part in parts for key in part)
+        assert sum(not part for part in parts) == 2
