@@ -1,0 +1,178 @@
+"""Times a step of the network against the plain form of the same, and measures its memory.
+
+    python benchmarks/step.py [--out benchmarks/results/step.json] [--rounds 15]
+
+The plain form is what peers compute: a concatenation of gathered ends, linear layers and a sum by
+``index_add_``, with the same weights. All forms are timed in turn, round after round, and the
+medians compared. Memory is that of a process that takes one training step, above what it has
+before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from adaptgns import fused
+from adaptgns._core import radius_graph
+from adaptgns.network import VARIANCE_FLOOR, EncodeProcessDecode
+from adaptgns.segment import Graph
+
+SIZES = {
+    "width 128, 10 steps, 951 particles": (951, 5_865, 128, 2, 10),
+    "width 128, 10 steps, 359 particles": (359, 2_237, 128, 2, 10),
+    "width 128, 10 steps, 20,000 particles": (20_000, 123_000, 128, 2, 10),
+    "width 64, 5 steps, 722 particles": (722, 3_430, 64, 1, 5),
+}
+"""Particles, edges (about, self-edges included), width, hidden layers, message-passing steps"""
+FORMS = ("plain", "torch", "core", "plain bf16")
+"""plain: see above; torch: what runs on GPUs; core: what runs on CPUs; bf16: under autocast"""
+
+
+def plain(net: EncodeProcessDecode, nodes: Tensor, edges: Tensor, graph: Graph) -> list[Tensor]:
+    """The network as peers write it."""
+    assert net.edge_encoder is not None
+    assert net.variance_head is not None
+    nodes, edges = net.node_encoder(nodes), net.edge_encoder(edges)
+    for layer in net.layers:
+        ends = torch.cat([nodes[graph.receivers], nodes[graph.senders], edges], dim=1)
+        messages = layer.edge_mlp(ends)
+        incoming = torch.zeros_like(nodes, dtype=messages.dtype)
+        incoming = incoming.index_add_(0, graph.receivers, messages)
+        nodes = nodes + layer.node_mlp(torch.cat([incoming, nodes], dim=1))
+        edges = edges + messages
+    return [net.decoder(nodes), softplus(net.variance_head(nodes)).squeeze(1) + VARIANCE_FLOOR]
+
+
+class Case:
+    def __init__(self, size: str) -> None:
+        particles, edges, width, hidden_layers, steps = SIZES[size]
+        torch.manual_seed(0)
+        rng = np.random.default_rng(0)
+        self.net = EncodeProcessDecode(
+            30,
+            3,
+            2,
+            latent=width,
+            hidden_layers=hidden_layers,
+            steps=steps,
+            edges=True,
+            variance=True,
+        )
+        positions = rng.random((particles, 2))
+        radius = ((edges / particles - 1) / (np.pi * particles)) ** 0.5
+        self.graph = Graph.from_numpy(
+            *radius_graph(positions, radius, self_edges=True, return_offsets=True)
+        )
+        self.nodes = torch.randn(particles, 30)
+        self.edges = torch.randn(len(self.graph.senders), 3)
+
+    def outputs(self, form: str) -> list[Tensor]:
+        fused.applies = lambda _: form == "core"
+        low = torch.autocast("cpu", torch.bfloat16) if "bf16" in form else nullcontext()
+        with low:
+            if form.startswith("plain"):
+                return plain(self.net, self.nodes, self.edges, self.graph)
+            prediction = self.net(self.nodes, self.edges, self.graph)
+            return [prediction.acceleration, prediction.variance]
+
+    def forward(self, form: str) -> None:
+        with torch.inference_mode():
+            self.outputs(form)
+
+    def step(self, form: str) -> None:
+        self.net.zero_grad()
+        acceleration, variance = self.outputs(form)
+        ((acceleration.square().sum(1) / variance).mean() + variance.log().mean()).backward()
+
+
+def medians(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, float]:
+    """Milliseconds of each call, timed in turn."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for round_number in range(rounds + 2):
+        for name, call in calls.items():
+            call()  # what another form has freed is not paid for here
+            started = time.perf_counter()
+            call()
+            if round_number >= 2:
+                times[name].append(1e3 * (time.perf_counter() - started))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def peak_memory(size: str, form: str) -> float:
+    """MiB that a training step takes, in a process of its own."""
+    command = [sys.executable, __file__, "--memory", size, form]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def print_memory(size: str, form: str) -> None:
+    case = Case(size)
+    torch.linalg.norm(torch.randn(500, 500) @ torch.randn(500, 500))  # libraries are loaded
+    before = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    case.step(form)
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10 - before / 2**20)
+
+
+def measure(rounds: int) -> dict[str, object]:
+    results = {}
+    for size in SIZES:
+        case = Case(size)
+        exact = case.outputs("plain")
+        rounds_here = max(3, rounds // 5) if case.nodes.shape[0] > 5_000 else rounds
+        forward = medians({form: partial(case.forward, form) for form in FORMS}, rounds_here)
+        step = medians({form: partial(case.step, form) for form in FORMS}, rounds_here)
+        rows = {}
+        for form in FORMS:
+            outputs = case.outputs(form)
+            off = [float((a - b).norm() / b.norm()) for a, b in zip(outputs, exact, strict=True)]
+            rows[form] = {
+                "forward_ms": forward[form],
+                "step_ms": step[form],
+                "forward_ratio": forward["plain"] / forward[form],
+                "step_ratio": step["plain"] / step[form],
+                "step_mib": peak_memory(size, form),
+                "relative_difference": max(off),
+            }
+        results[size] = {"edges": len(case.graph.senders), "forms": rows}
+        for form, row in rows.items():
+            print(f"{size:40} {form:12}", "  ".join(f"{k} {v:.3g}" for k, v in row.items()))
+    return results
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--memory", nargs=2, metavar=("SIZE", "FORM"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.memory:
+        print_memory(*options.memory)
+        return
+    report = {
+        "processor": platform.processor() or platform.machine(),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "rounds": options.rounds,
+        "sizes": measure(options.rounds),
+    }
+    if options.out:
+        options.out.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
