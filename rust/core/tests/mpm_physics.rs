@@ -1,6 +1,8 @@
 //! The solver obeys mechanics: what is conserved stays, what rests stays at rest.
 
-use adaptgns_core::mpm::{FRAME_TIME, GRAVITY, Material, Sand, Scene, Simulation, Walls, Water};
+use adaptgns_core::mpm::{
+    Bar, Body, FRAME_TIME, GRAVITY, Goop, Material, Sand, Scene, Simulation, Walls, Water,
+};
 
 const BOX: Walls = Walls {
     low: 0.1,
@@ -20,6 +22,7 @@ fn sand() -> Material {
     Material::Sand(Sand {
         lambda: 350.0,
         mu: 230.0,
+        density: 1.0,
         friction_angle: 35.0_f64.to_radians(),
         wall_friction: 0.4,
         collision_time: 0.01,
@@ -40,7 +43,15 @@ fn lattice(low: [f64; 2], high: [f64; 2], velocity: [f64; 2]) -> Vec<([f64; 2], 
 }
 
 fn simulation(material: Material, particles: Vec<([f64; 2], [f64; 2])>) -> Simulation<2> {
-    Simulation::new(material, BOX, SPACING, 2.0 * SPACING, particles).unwrap()
+    let body = Body {
+        material,
+        particles,
+    };
+    among(vec![body], Vec::new())
+}
+
+fn among(bodies: Vec<Body<2>>, obstacles: Vec<Bar>) -> Simulation<2> {
+    Simulation::new(BOX, SPACING, 2.0 * SPACING, bodies, obstacles).unwrap()
 }
 
 fn run<const D: usize>(simulation: &mut Simulation<D>, frames: usize) {
@@ -222,8 +233,16 @@ fn a_slab_across_a_slippery_box_moves_as_in_two_dimensions() {
         flat.iter()
             .map(move |&(x, v)| (lift(x, place(layer)), lift(v, 0.0)))
     });
-    let mut thick = Simulation::<3>::new(inviscid, walls, spacing, 0.04, deep).unwrap();
-    let mut thin = Simulation::<2>::new(inviscid, walls, spacing, 0.04, flat.clone()).unwrap();
+    let deep = Body {
+        material: inviscid,
+        particles: deep.collect(),
+    };
+    let shallow = Body {
+        material: inviscid,
+        particles: flat.clone(),
+    };
+    let mut thick = Simulation::<3>::new(walls, spacing, 0.04, vec![deep], Vec::new()).unwrap();
+    let mut thin = Simulation::<2>::new(walls, spacing, 0.04, vec![shallow], Vec::new()).unwrap();
     for _ in 0..80 {
         thick.advance_frame();
         thin.advance_frame();

@@ -22,8 +22,8 @@ fn a_hundred_seeds_stay_in_the_box_for_a_thousand_frames() {
     (0..100_u64).into_par_iter().for_each(|seed| {
         let scene = SCENES[seed as usize % 2];
         let made = trajectory::<2>(scene, seed, 1000, Some((16, 150))).unwrap();
-        assert!((16..=150).contains(&made.particles));
-        assert_eq!(made.positions.len(), 1000 * made.particles);
+        assert!((16..=150).contains(&made.particle_types.len()));
+        assert_eq!(made.positions.len(), 1000 * made.particle_types.len());
         assert_inside(&made);
     });
 }
@@ -34,7 +34,7 @@ fn full_scenes_and_three_dimensions_stay_in_the_box() {
         let scene = SCENES[seed as usize % 2];
         assert_inside(&trajectory::<2>(scene, seed, 320, None).unwrap());
         let solid = trajectory::<3>(scene, seed, 150, Some((300, 600))).unwrap();
-        assert!((300..=600).contains(&solid.particles));
+        assert!((300..=600).contains(&solid.particle_types.len()));
         assert_inside(&solid);
     });
 }
@@ -57,10 +57,10 @@ fn the_number_of_particles_is_the_one_asked_for() {
     for scene in SCENES {
         for count in [16, 17, 101, 997, 2000] {
             let made = trajectory::<2>(scene, 3, 1, Some((count, count))).unwrap();
-            assert_eq!(made.particles, count);
+            assert_eq!(made.particle_types.len(), count);
         }
         let made = trajectory::<3>(scene, 3, 1, Some((1001, 1001))).unwrap();
-        assert_eq!(made.particles, 1001);
+        assert_eq!(made.particle_types.len(), 1001);
     }
 }
 
@@ -116,7 +116,10 @@ fn scenes_have_the_published_graph_statistics() {
         (Scene::Sand, 1270.0, 6.76, 0.500),
     ];
     for (scene, particles, degree, clustering) in published {
-        let counts = (0..200).map(|seed| trajectory::<2>(scene, seed, 1, None).unwrap().particles);
+        let counts = (0..200).map(|seed| {
+            let made = trajectory::<2>(scene, seed, 1, None).unwrap();
+            made.particle_types.len()
+        });
         let mean = counts.sum::<usize>() as f64 / 200.0;
         assert!((mean / particles - 1.0).abs() < 0.1, "{mean} particles");
 
@@ -125,7 +128,7 @@ fn scenes_have_the_published_graph_statistics() {
             .into_par_iter()
             .map(|seed| {
                 let made = trajectory::<2>(scene, seed, 101, None).unwrap();
-                graph_statistics(&made.positions[100 * made.particles..])
+                graph_statistics(&made.positions[100 * made.particle_types.len()..])
             })
             .collect();
         let mean_degree = found.iter().map(|pair| pair.0).sum::<f64>() / seeds as f64;

@@ -21,14 +21,17 @@ pub struct Walls {
 #[derive(Clone, Copy)]
 pub(crate) struct Node<const D: usize> {
     pub mass: f64,
-    /// Momentum while particles are gathered, velocity after the update.
+    /// Momentum while particles are scattered, velocity after the update.
     pub velocity: [f64; D],
+    /// Friction coefficient of the roughest material that reaches the node.
+    pub friction: f64,
 }
 
 impl<const D: usize> Node<D> {
     const EMPTY: Self = Self {
         mass: 0.0,
         velocity: [0.0; D],
+        friction: 0.0,
     };
 }
 
@@ -116,7 +119,7 @@ impl<const D: usize> Grid<D> {
 
     /// Empties the nodes in use and takes into use those around `positions`.
     pub(crate) fn cover<'a>(&mut self, positions: impl Iterator<Item = &'a [f64; D]>) {
-        self.for_each_node(|node, _| *node = Node::EMPTY);
+        self.for_each_node(|node, _, _| *node = Node::EMPTY);
         let (mut low, mut high) = ([f64::INFINITY; D], [f64::NEG_INFINITY; D]);
         for position in positions {
             for axis in 0..D {
@@ -136,22 +139,29 @@ impl<const D: usize> Grid<D> {
         (first, x - first as f64)
     }
 
-    /// Calls `visit` for each node in use with its place along each axis: -1 or 1 on the
-    /// low or high wall or beyond, 0 between.
-    pub(crate) fn for_each_node(&mut self, mut visit: impl FnMut(&mut Node<D>, [f64; D])) {
+    /// Calls `visit` for each node in use with its position, and its place along each
+    /// axis: -1 or 1 on the low or high wall or beyond, 0 between.
+    pub(crate) fn for_each_node(
+        &mut self,
+        mut visit: impl FnMut(&mut Node<D>, [f64; D], [f64; D]),
+    ) {
         if self.active.iter().any(Range::is_empty) {
             return;
         }
+        let (low, spacing) = (self.walls.low, self.spacing);
+        let coordinate = |along: usize| low + (along as f64 - PADDING as f64) * spacing;
         let last = self.active[D - 1].clone();
         let mut index: [usize; D] = std::array::from_fn(|axis| self.active[axis].start);
         loop {
             let row: usize = (0..D - 1)
                 .map(|axis| index[axis] * self.strides[axis])
                 .sum();
+            let mut position = index.map(coordinate);
             let mut sides = index.map(|along| self.sides[along]);
             for along in last.clone() {
+                position[D - 1] = coordinate(along);
                 sides[D - 1] = self.sides[along];
-                visit(&mut self.nodes[row + along], sides);
+                visit(&mut self.nodes[row + along], position, sides);
             }
             let Some(axis) = (0..D - 1).rfind(|&axis| index[axis] + 1 < self.active[axis].end)
             else {

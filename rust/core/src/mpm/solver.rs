@@ -2,7 +2,8 @@
 
 use super::grid::{Grid, Stencil, Walls};
 use super::linalg::{self, Matrix};
-use super::material::{Contact, History, Material};
+use super::material::{History, Material};
+use super::obstacle::{Bar, Pose};
 use super::separation::Separation;
 use crate::Error;
 
@@ -18,6 +19,9 @@ const DIFFUSION: f64 = 0.12;
 /// Distance that particles keep from the walls, in grid spacings: small against their
 /// own distance, large against the rounding of a position to single precision.
 const WALL_MARGIN: f64 = 0.05;
+/// Distance from an obstacle at which a node stops what runs into it, in grid spacings: its
+/// surface lies between nodes, and this half puts it where they do on average.
+const OBSTACLE_REACH: f64 = 0.5;
 /// Part of what a close pair lacks in distance that is made up in one frame: slow enough
 /// to add nothing visible to the accelerations.
 const SEPARATION_RATE: f64 = 0.1;
@@ -29,39 +33,61 @@ struct Particle<const D: usize> {
     velocity: [f64; D],
     velocity_gradient: Matrix<D>,
     history: History<D>,
+    /// Index into the simulation's materials.
+    material: usize,
 }
 
-/// Particles of one material in a box, after Hu et al., "A moving least squares material
+/// Particles of one material: their positions \[m\] and velocities \[m/s\].
+#[derive(Debug, Clone, PartialEq)]
+pub struct Body<const D: usize> {
+    /// What they are made of, for good.
+    pub material: Material,
+    /// Position and velocity of each.
+    pub particles: Vec<([f64; D], [f64; D])>,
+}
+
+/// Bodies of one or several materials in a box with obstacles, after Hu et al., "A moving least squares material
 /// point method" (2018), with affine transfers (Jiang et al. 2015).
 ///
 /// A step scatters mass, momentum and stress to the grid, solves there for velocities
-/// with gravity and walls, and gathers them back. Velocities live half a step before the
+/// with gravity, walls and obstacles, and gathers them back. All materials share one
+/// velocity field: they stick to each other where they touch and mix no finer than a cell. Velocities live half a step before the
 /// positions, so that free flight is an exact parabola whatever the step.
 pub struct Simulation<const D: usize> {
     particles: Vec<Particle<D>>,
-    material: Material,
+    materials: Vec<Material>,
+    obstacles: Vec<Bar>,
+    /// The obstacles at the time of the positions.
+    poses: Vec<Pose>,
     grid: Grid<D>,
     separation: Separation<D>,
     walls: Walls,
-    particle_mass: f64,
+    particle_spacing: f64,
+    /// Volume of a particle at rest.
+    volume: f64,
+    /// Frames since the beginning.
+    frame: u64,
     /// Length of the last step \[s\].
     step: f64,
 }
 
 impl<const D: usize> Simulation<D> {
-    /// Particles of equal mass, at rest density when `particle_spacing` apart on a
-    /// square lattice, on a grid of about `grid_spacing`. Positions outside the walls
-    /// are moved to them.
+    /// Particles of equal volume, at rest density when `particle_spacing` apart on a
+    /// square lattice, on a grid of about `grid_spacing`. Positions outside the walls or
+    /// inside an obstacle are moved to their surface.
+    ///
+    /// Obstacles keep matter on their two sides apart if they are at least two grid
+    /// spacings thick.
     ///
     /// # Errors
     ///
     /// If a length is not positive and finite, or a position or velocity not finite.
     pub fn new(
-        material: Material,
         walls: Walls,
         particle_spacing: f64,
         grid_spacing: f64,
-        particles: impl IntoIterator<Item = ([f64; D], [f64; D])>,
+        bodies: Vec<Body<D>>,
+        obstacles: Vec<Bar>,
     ) -> Result<Self, Error> {
         const {
             assert!(D == 2 || D == 3);
@@ -79,31 +105,38 @@ impl<const D: usize> Simulation<D> {
                 ));
             }
         }
-        let particles: Vec<_> = particles.into_iter().collect();
-        for (position, velocity) in &particles {
-            if !position.iter().chain(velocity).all(|x| x.is_finite()) {
-                return Err(Error::invalid(
-                    "particles",
-                    format!("got {position:?} moving at {velocity:?}, accepted are finite numbers"),
-                ));
+        let materials = bodies.iter().map(|body| body.material).collect();
+        let mut particles = Vec::with_capacity(bodies.iter().map(|b| b.particles.len()).sum());
+        for (material, body) in bodies.into_iter().enumerate() {
+            for (position, velocity) in body.particles {
+                if !position.iter().chain(&velocity).all(|x| x.is_finite()) {
+                    return Err(Error::invalid(
+                        "particles",
+                        format!(
+                            "got {position:?} moving at {velocity:?}, accepted are finite numbers"
+                        ),
+                    ));
+                }
+                particles.push(Particle {
+                    position,
+                    velocity,
+                    velocity_gradient: linalg::zero(),
+                    history: History::at_rest(),
+                    material,
+                });
             }
         }
-        let particles = particles
-            .into_iter()
-            .map(|(position, velocity)| Particle {
-                position,
-                velocity,
-                velocity_gradient: linalg::zero(),
-                history: History::at_rest(),
-            })
-            .collect();
         let mut simulation = Self {
             particles,
-            material,
+            materials,
+            poses: obstacles.iter().map(|bar| bar.at(0.0)).collect(),
+            obstacles,
             grid: Grid::new(walls, grid_spacing),
             separation: Separation::new(walls, particle_spacing),
             walls,
-            particle_mass: particle_spacing.powi(D as i32),
+            particle_spacing,
+            volume: particle_spacing.powi(D as i32),
+            frame: 0,
             step: 0.0,
         };
         simulation.keep_inside();
@@ -117,18 +150,26 @@ impl<const D: usize> Simulation<D> {
             let square = linalg::dot(&particle.velocity, &particle.velocity);
             assert!(square.is_finite(), "a stable step cannot diverge");
             fastest = fastest.max(square.sqrt());
-            sound = sound.max(self.material.sound_speed(&particle.history));
+            let material = &self.materials[particle.material];
+            sound = sound.max(material.sound_speed(&particle.history));
         }
+        for bar in &self.obstacles {
+            fastest = fastest.max(bar.top_speed());
+        }
+        let viscosities = self.materials.iter().map(Material::viscosity);
+        let viscosity = viscosities.fold(0.0, f64::max);
         let spacing = self.grid.spacing;
         let longest = f64::min(
             COURANT * spacing / (fastest + sound),
-            DIFFUSION * spacing.powi(2) / self.material.viscosity(),
+            DIFFUSION * spacing.powi(2) / viscosity,
         );
         let steps = (FRAME_TIME / longest).ceil().max(1.0);
         self.change_step(FRAME_TIME / steps);
-        for _ in 0..steps as usize {
-            self.advance_step();
+        for step in 1..=steps as usize {
+            let time = FRAME_TIME * (self.frame as f64 + step as f64 / steps);
+            self.advance_step(time);
         }
+        self.frame += 1;
         self.separate(SEPARATION_RATE);
     }
 
@@ -146,16 +187,46 @@ impl<const D: usize> Simulation<D> {
         })
     }
 
-    /// Mass of all particles, with rest density 1.
+    /// GNS's particle types in the order of construction.
+    pub fn particle_types(&self) -> impl ExactSizeIterator<Item = i64> {
+        let material = |particle: &Particle<D>| &self.materials[particle.material];
+        self.particles
+            .iter()
+            .map(move |particle| material(particle).particle_type())
+    }
+
+    /// The bars that the particles collide with.
+    pub fn obstacles(&self) -> &[Bar] {
+        &self.obstacles
+    }
+
+    /// Positions of the obstacles' own particles \[m\], which fill them as densely as matter
+    /// at rest fills the box; always the same ones in the same order.
+    pub fn obstacle_positions(&self) -> impl Iterator<Item = [f64; D]> {
+        self.obstacles
+            .iter()
+            .zip(&self.poses)
+            .flat_map(|(bar, pose)| {
+                bar.lattice::<D>(self.walls, self.particle_spacing)
+                    .into_iter()
+                    .map(|point| pose.place(point))
+            })
+    }
+
+    /// Mass of all particles, where water at rest has density 1.
     pub fn mass(&self) -> f64 {
-        self.particle_mass * self.particles.len() as f64
+        self.particles.iter().map(|p| self.mass_of(p)).sum()
     }
 
     /// Sum of mass times velocity.
     pub fn momentum(&self) -> [f64; D] {
-        self.velocities().fold([0.0; D], |sum, velocity| {
-            std::array::from_fn(|axis| sum[axis] + self.particle_mass * velocity[axis])
-        })
+        let mut momentum = [0.0; D];
+        for (particle, velocity) in self.particles.iter().zip(self.velocities()) {
+            for axis in 0..D {
+                momentum[axis] += self.mass_of(particle) * velocity[axis];
+            }
+        }
+        momentum
     }
 
     /// Kinetic, potential and stored energy.
@@ -171,13 +242,17 @@ impl<const D: usize> Simulation<D> {
                     .iter()
                     .map(|row| linalg::dot(row, row))
                     .sum();
-                0.5 * linalg::dot(&velocity, &velocity)
+                let per_mass = 0.5 * linalg::dot(&velocity, &velocity)
                     + 0.5 * inertia * spin
                     + GRAVITY * (particle.position[1] - self.walls.low)
-                    + self.material.energy(&particle.history)
+                    + self.materials[particle.material].energy(&particle.history);
+                self.mass_of(particle) * per_mass
             })
-            .sum::<f64>()
-            * self.particle_mass
+            .sum()
+    }
+
+    fn mass_of(&self, particle: &Particle<D>) -> f64 {
+        self.volume * self.materials[particle.material].density()
     }
 
     /// Velocities are those of half a step before: a new step moves that moment, between
@@ -190,20 +265,26 @@ impl<const D: usize> Simulation<D> {
         self.step = step;
     }
 
-    fn advance_step(&mut self) {
+    /// One step, to the time `end`.
+    fn advance_step(&mut self, end: f64) {
         self.grid
             .cover(self.particles.iter().map(|particle| &particle.position));
         self.scatter();
         self.update_grid();
         self.gather();
+        self.poses.clear();
+        self.poses
+            .extend(self.obstacles.iter().map(|bar| bar.at(end)));
         self.keep_inside();
     }
 
     fn scatter(&mut self) {
-        let mass = self.particle_mass;
         let stress_scale = -self.step * 4.0 / self.grid.spacing.powi(2);
         for particle in &mut self.particles {
-            let stress = self.material.stress(
+            let material = &self.materials[particle.material];
+            let mass = self.volume * material.density();
+            let friction = material.wall_friction();
+            let stress = material.stress(
                 &mut particle.history,
                 &particle.velocity_gradient,
                 self.step,
@@ -219,6 +300,9 @@ impl<const D: usize> Simulation<D> {
                 let node = &mut self.grid.nodes[stencil.nodes[k]];
                 let weighted_mass = stencil.weights[k] * mass;
                 node.mass += weighted_mass;
+                if friction > node.friction {
+                    node.friction = friction;
+                }
                 for axis in 0..D {
                     node.velocity[axis] += weighted_mass
                         * (particle.velocity[axis] + linalg::dot(&affine[axis], &stencil.arms[k]));
@@ -227,11 +311,12 @@ impl<const D: usize> Simulation<D> {
         }
     }
 
-    /// Momentum to velocity, gravity, walls.
+    /// Momentum to velocity, gravity, obstacles, walls.
     fn update_grid(&mut self) {
         let kick = -GRAVITY * self.step;
-        let contact = self.material.contact();
-        self.grid.for_each_node(|node, sides| {
+        let reach = OBSTACLE_REACH * self.grid.spacing;
+        let poses = &self.poses;
+        self.grid.for_each_node(|node, position, sides| {
             if node.mass == 0.0 {
                 return;
             }
@@ -239,12 +324,16 @@ impl<const D: usize> Simulation<D> {
                 *component /= node.mass;
             }
             node.velocity[1] += kick;
+            for pose in poses {
+                let point = [position[0], position[1]];
+                pose.stop(&mut node.velocity, point, reach, node.friction);
+            }
             for axis in 0..D {
                 let into = sides[axis] * node.velocity[axis];
                 if into > 0.0 {
                     node.velocity[axis] = 0.0;
-                    if let Contact::Friction(coefficient) = contact {
-                        slow(&mut node.velocity, axis, coefficient * into);
+                    if node.friction > 0.0 {
+                        slow(&mut node.velocity, axis, node.friction * into);
                     }
                 }
             }
@@ -295,10 +384,14 @@ impl<const D: usize> Simulation<D> {
         }
     }
 
+    /// Out of the obstacles and, above all, inside the walls.
     fn keep_inside(&mut self) {
         let margin = WALL_MARGIN * self.grid.spacing;
         let (low, high) = (self.walls.low + margin, self.walls.high - margin);
         for particle in &mut self.particles {
+            for pose in &self.poses {
+                pose.push_out(&mut particle.position, margin);
+            }
             for x in &mut particle.position {
                 *x = x.clamp(low, high);
             }
