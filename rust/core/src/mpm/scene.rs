@@ -252,13 +252,15 @@ impl Scene {
     }
 }
 
-/// One to three inclined bars side by side, with room for matter to pass on both sides of
-/// each and beneath.
+/// One to three inclined bars side by side, longer than thick, with room for matter to pass
+/// on both sides of each and beneath.
 fn ramps(rng: &mut Rng, thickness: f64) -> Vec<Bar> {
     const LONGEST: f64 = 0.36;
     const GAP: f64 = 0.1;
-    let number = rng.integer(1, 3);
-    let slot = (WALLS.high - WALLS.low) / number as f64;
+    let width = WALLS.high - WALLS.low;
+    let most = (width / (GAP + 2.0 * thickness)) as usize;
+    let number = rng.integer(1, most.min(3));
+    let slot = width / number as f64;
     (0..number)
         .map(|index| {
             let steepness = rng.uniform(15.0_f64.to_radians(), 40.0_f64.to_radians());

@@ -19,9 +19,10 @@ const DIFFUSION: f64 = 0.12;
 /// Distance that particles keep from the walls, in grid spacings: small against their
 /// own distance, large against the rounding of a position to single precision.
 const WALL_MARGIN: f64 = 0.05;
-/// Distance from an obstacle at which a node stops what runs into it, in grid spacings: its
-/// surface lies between nodes, and this half puts it where they do on average.
-const OBSTACLE_REACH: f64 = 0.5;
+/// Distance from an obstacle at which a node stops what runs into it, in grid spacings: all
+/// nodes that a particle on the surface weighs most on. With half of it, water around a bar
+/// never came to rest and lost 3 % of its volume in five seconds; with this, 0.1 %.
+const OBSTACLE_REACH: f64 = 1.0;
 /// Part of what a close pair lacks in distance that is made up in one frame: slow enough
 /// to add nothing visible to the accelerations.
 const SEPARATION_RATE: f64 = 0.1;
