@@ -228,7 +228,7 @@ impl Scene {
             },
             Self::MultiMaterial => Recipe {
                 materials: &[WATER, SAND, GOOP],
-                particles: [(600, 1800), (2000, 8000)],
+                particles: [(600, 1800), (2000, 5000)],
                 blocks: &[0.0, 0.25, 0.5, 0.25],
                 sideways: (-1.5, 1.5),
                 upwards: (-2.0, 0.5),
