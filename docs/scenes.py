@@ -40,7 +40,7 @@ class Picture:
 PICTURES = {
     "waterdrop": Picture("waterdrop", (0, 110, 170, 900)),
     "sand": Picture("sand", (0, 50, 100, 310)),
-    "goop": Picture("goop", (0, 60, 100, 390), seed=2),
+    "goop": Picture("goop", (0, 60, 100, 390)),
     "jelly": Picture("jelly", (0, 71, 110, 200), seed=4),
     "multimaterial": Picture("multimaterial", (0, 90, 140, 900), seed=3),
     "waterramps": Picture("waterramps", (0, 100, 150, 350)),

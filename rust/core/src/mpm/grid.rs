@@ -23,16 +23,21 @@ pub(crate) struct Node<const D: usize> {
     pub mass: f64,
     /// Momentum while particles are scattered, velocity after the update.
     pub velocity: [f64; D],
-    /// Friction coefficient of the roughest material that reaches the node.
-    pub friction: f64,
 }
 
 impl<const D: usize> Node<D> {
     const EMPTY: Self = Self {
         mass: 0.0,
         velocity: [0.0; D],
-        friction: 0.0,
     };
+}
+
+/// Where a node is.
+pub(crate) struct Place<const D: usize> {
+    pub index: usize,
+    pub position: [f64; D],
+    /// Along each axis, -1 or 1 on the low or high wall or beyond, 0 between.
+    pub sides: [f64; D],
 }
 
 /// The nodes around a particle: index, spline weight, and vector from the particle.
@@ -119,7 +124,7 @@ impl<const D: usize> Grid<D> {
 
     /// Empties the nodes in use and takes into use those around `positions`.
     pub(crate) fn cover<'a>(&mut self, positions: impl Iterator<Item = &'a [f64; D]>) {
-        self.for_each_node(|node, _, _| *node = Node::EMPTY);
+        self.for_each_node(|node, _| *node = Node::EMPTY);
         let (mut low, mut high) = ([f64::INFINITY; D], [f64::NEG_INFINITY; D]);
         for position in positions {
             for axis in 0..D {
@@ -139,12 +144,8 @@ impl<const D: usize> Grid<D> {
         (first, x - first as f64)
     }
 
-    /// Calls `visit` for each node in use with its position, and its place along each
-    /// axis: -1 or 1 on the low or high wall or beyond, 0 between.
-    pub(crate) fn for_each_node(
-        &mut self,
-        mut visit: impl FnMut(&mut Node<D>, [f64; D], [f64; D]),
-    ) {
+    /// Calls `visit` for each node in use.
+    pub(crate) fn for_each_node(&mut self, mut visit: impl FnMut(&mut Node<D>, Place<D>)) {
         if self.active.iter().any(Range::is_empty) {
             return;
         }
@@ -161,7 +162,13 @@ impl<const D: usize> Grid<D> {
             for along in last.clone() {
                 position[D - 1] = coordinate(along);
                 sides[D - 1] = self.sides[along];
-                visit(&mut self.nodes[row + along], position, sides);
+                let index = row + along;
+                let place = Place {
+                    index,
+                    position,
+                    sides,
+                };
+                visit(&mut self.nodes[index], place);
             }
             let Some(axis) = (0..D - 1).rfind(|&axis| index[axis] + 1 < self.active[axis].end)
             else {

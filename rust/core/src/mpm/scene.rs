@@ -46,7 +46,7 @@ const SAND: Material = Material::Sand(Sand {
 const GOOP: Material = Material::Goop(Goop {
     bulk: 300.0,
     shear: 100.0,
-    yield_stress: 1.2,
+    yield_stress: 2.0,
     viscosity: 0.02,
     wall_friction: 0.5,
 });

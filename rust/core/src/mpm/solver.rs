@@ -60,6 +60,11 @@ pub struct Simulation<const D: usize> {
     obstacles: Vec<Bar>,
     /// The obstacles at the time of the positions.
     poses: Vec<Pose>,
+    /// Friction coefficient at walls and obstacles of the roughest material.
+    friction: f64,
+    /// The same of the roughest material that reaches each node; empty where all materials
+    /// are equally rough.
+    frictions: Vec<f64>,
     grid: Grid<D>,
     separation: Separation<D>,
     walls: Walls,
@@ -106,7 +111,14 @@ impl<const D: usize> Simulation<D> {
                 ));
             }
         }
-        let materials = bodies.iter().map(|body| body.material).collect();
+        let materials: Vec<_> = bodies.iter().map(|body| body.material).collect();
+        let friction = materials
+            .iter()
+            .map(Material::wall_friction)
+            .fold(0.0, f64::max);
+        let differ = materials.iter().any(|m| m.wall_friction() != friction);
+        let grid = Grid::new(walls, grid_spacing);
+        let frictions = vec![0.0; if differ { grid.nodes.len() } else { 0 }];
         let mut particles = Vec::with_capacity(bodies.iter().map(|b| b.particles.len()).sum());
         for (material, body) in bodies.into_iter().enumerate() {
             for (position, velocity) in body.particles {
@@ -132,7 +144,9 @@ impl<const D: usize> Simulation<D> {
             materials,
             poses: obstacles.iter().map(|bar| bar.at(0.0)).collect(),
             obstacles,
-            grid: Grid::new(walls, grid_spacing),
+            friction,
+            frictions,
+            grid,
             separation: Separation::new(walls, particle_spacing),
             walls,
             particle_spacing,
@@ -271,6 +285,9 @@ impl<const D: usize> Simulation<D> {
         self.grid
             .cover(self.particles.iter().map(|particle| &particle.position));
         self.scatter();
+        if !self.frictions.is_empty() {
+            self.scatter_friction();
+        }
         self.update_grid();
         self.gather();
         self.poses.clear();
@@ -284,7 +301,6 @@ impl<const D: usize> Simulation<D> {
         for particle in &mut self.particles {
             let material = &self.materials[particle.material];
             let mass = self.volume * material.density();
-            let friction = material.wall_friction();
             let stress = material.stress(
                 &mut particle.history,
                 &particle.velocity_gradient,
@@ -301,9 +317,6 @@ impl<const D: usize> Simulation<D> {
                 let node = &mut self.grid.nodes[stencil.nodes[k]];
                 let weighted_mass = stencil.weights[k] * mass;
                 node.mass += weighted_mass;
-                if friction > node.friction {
-                    node.friction = friction;
-                }
                 for axis in 0..D {
                     node.velocity[axis] += weighted_mass
                         * (particle.velocity[axis] + linalg::dot(&affine[axis], &stencil.arms[k]));
@@ -312,12 +325,23 @@ impl<const D: usize> Simulation<D> {
         }
     }
 
+    fn scatter_friction(&mut self) {
+        self.frictions.fill(0.0);
+        for particle in &self.particles {
+            let friction = self.materials[particle.material].wall_friction();
+            let stencil = self.grid.stencil(&particle.position);
+            for &node in &stencil.nodes[..Stencil::<D>::LEN] {
+                self.frictions[node] = self.frictions[node].max(friction);
+            }
+        }
+    }
+
     /// Momentum to velocity, gravity, obstacles, walls.
     fn update_grid(&mut self) {
         let kick = -GRAVITY * self.step;
         let reach = OBSTACLE_REACH * self.grid.spacing;
-        let poses = &self.poses;
-        self.grid.for_each_node(|node, position, sides| {
+        let (poses, common, frictions) = (&self.poses, self.friction, &self.frictions);
+        self.grid.for_each_node(|node, place| {
             if node.mass == 0.0 {
                 return;
             }
@@ -325,16 +349,17 @@ impl<const D: usize> Simulation<D> {
                 *component /= node.mass;
             }
             node.velocity[1] += kick;
+            let friction = frictions.get(place.index).copied().unwrap_or(common);
             for pose in poses {
-                let point = [position[0], position[1]];
-                pose.stop(&mut node.velocity, point, reach, node.friction);
+                let point = [place.position[0], place.position[1]];
+                pose.stop(&mut node.velocity, point, reach, friction);
             }
             for axis in 0..D {
-                let into = sides[axis] * node.velocity[axis];
+                let into = place.sides[axis] * node.velocity[axis];
                 if into > 0.0 {
                     node.velocity[axis] = 0.0;
-                    if node.friction > 0.0 {
-                        slow(&mut node.velocity, axis, node.friction * into);
+                    if friction > 0.0 {
+                        slow(&mut node.velocity, axis, friction * into);
                     }
                 }
             }
