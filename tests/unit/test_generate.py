@@ -46,7 +46,11 @@ def test_a_whole_data_set(tmp_path: Path, scene: str, dim: int) -> None:
     assert set(contents(tmp_path)) == {"train.h5", "valid.h5", "test.h5", "metadata.json"}
     metadata = read_metadata(tmp_path)
     assert metadata.bounds == ((0.1, 0.9),) * dim
-    assert (metadata.dim, metadata.dt, metadata.radius) == (dim, 0.0025, 0.015 if dim == 2 else 0.035)
+    assert (metadata.dim, metadata.dt, metadata.radius) == (
+        dim,
+        0.0025,
+        0.015 if dim == 2 else 0.035,
+    )
     assert metadata.kinematic_types == (3,)
     assert metadata.box is None
     train = open_split(tmp_path, "train")

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-SceneName = Literal[
-    "waterdrop", "sand", "goop", "jelly", "multimaterial", "waterramps", "stirrer"
-]
+SceneName = Literal["waterdrop", "sand", "goop", "jelly", "multimaterial", "waterramps", "stirrer"]
 
 
 @dataclass(frozen=True)

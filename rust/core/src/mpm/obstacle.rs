@@ -43,6 +43,14 @@ impl Bar {
         self.at(time).distance(point).0
     }
 
+    /// Whether it has a size and is somewhere at all times.
+    pub(crate) fn is_possible(&self) -> bool {
+        let lengths = [self.half[0], self.half[1], self.period];
+        let numbers = [self.centre, self.swing, [self.angle, self.spin]];
+        lengths.iter().all(|x| *x > 0.0 && x.is_finite())
+            && numbers.as_flattened().iter().all(|x| x.is_finite())
+    }
+
     /// Speed \[m/s\] that no point of the bar exceeds.
     pub(crate) fn top_speed(&self) -> f64 {
         self.swing[0].hypot(self.swing[1]) * TAU / self.period

@@ -87,7 +87,8 @@ impl<const D: usize> Simulation<D> {
     ///
     /// # Errors
     ///
-    /// If a length is not positive and finite, or a position or velocity not finite.
+    /// If a length is not positive and finite, a position or velocity not finite, or an
+    /// obstacle without size or not always somewhere.
     pub fn new(
         walls: Walls,
         particle_spacing: f64,
@@ -110,6 +111,12 @@ impl<const D: usize> Simulation<D> {
                     format!("got a length of {length}, accepted are positive ones"),
                 ));
             }
+        }
+        if let Some(bar) = obstacles.iter().find(|bar| !bar.is_possible()) {
+            return Err(Error::invalid(
+                "obstacles",
+                format!("got {bar:?}, accepted are finite numbers, with half and period above 0"),
+            ));
         }
         let materials: Vec<_> = bodies.iter().map(|body| body.material).collect();
         let friction = materials
