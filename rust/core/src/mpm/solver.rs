@@ -1,5 +1,7 @@
 //! The moving least squares material point method.
 
+use std::ops::Range;
+
 use super::grid::{Grid, Stencil, Walls};
 use super::linalg::{self, Matrix};
 use super::material::{History, Material};
@@ -34,8 +36,6 @@ struct Particle<const D: usize> {
     velocity: [f64; D],
     velocity_gradient: Matrix<D>,
     history: History<D>,
-    /// Index into the simulation's materials.
-    material: usize,
 }
 
 /// Particles of one material: their positions \[m\] and velocities \[m/s\].
@@ -47,16 +47,18 @@ pub struct Body<const D: usize> {
     pub particles: Vec<([f64; D], [f64; D])>,
 }
 
-/// Bodies of one or several materials in a box with obstacles, after Hu et al., "A moving least squares material
-/// point method" (2018), with affine transfers (Jiang et al. 2015).
+/// Bodies of one or several materials in a box with obstacles, after Hu et al., "A moving
+/// least squares material point method" (2018), with affine transfers (Jiang et al. 2015).
 ///
 /// A step scatters mass, momentum and stress to the grid, solves there for velocities
 /// with gravity, walls and obstacles, and gathers them back. All materials share one
-/// velocity field: they stick to each other where they touch and mix no finer than a cell. Velocities live half a step before the
-/// positions, so that free flight is an exact parabola whatever the step.
+/// velocity field: where they touch they do not slide along each other, and they mix no
+/// finer than a cell. Velocities live half a step before the positions, so that free
+/// flight is an exact parabola whatever the step.
 pub struct Simulation<const D: usize> {
     particles: Vec<Particle<D>>,
-    materials: Vec<Material>,
+    /// Materials, and the particles of each: body after body.
+    materials: Vec<(Material, Range<usize>)>,
     obstacles: Vec<Bar>,
     /// The obstacles at the time of the positions.
     poses: Vec<Pose>,
@@ -118,16 +120,16 @@ impl<const D: usize> Simulation<D> {
                 format!("got {bar:?}, accepted are finite numbers, with half and period above 0"),
             ));
         }
-        let materials: Vec<_> = bodies.iter().map(|body| body.material).collect();
-        let friction = materials
-            .iter()
-            .map(Material::wall_friction)
-            .fold(0.0, f64::max);
-        let differ = materials.iter().any(|m| m.wall_friction() != friction);
+        let rough = |body: &Body<D>| body.material.wall_friction();
+        let friction = bodies.iter().map(rough).fold(0.0, f64::max);
+        let differ = bodies.iter().any(|body| rough(body) != friction);
         let grid = Grid::new(walls, grid_spacing);
         let frictions = vec![0.0; if differ { grid.nodes.len() } else { 0 }];
+        let mut materials = Vec::with_capacity(bodies.len());
         let mut particles = Vec::with_capacity(bodies.iter().map(|b| b.particles.len()).sum());
-        for (material, body) in bodies.into_iter().enumerate() {
+        for body in bodies {
+            let first = particles.len();
+            materials.push((body.material, first..first + body.particles.len()));
             for (position, velocity) in body.particles {
                 if !position.iter().chain(&velocity).all(|x| x.is_finite()) {
                     return Err(Error::invalid(
@@ -142,7 +144,6 @@ impl<const D: usize> Simulation<D> {
                     velocity,
                     velocity_gradient: linalg::zero(),
                     history: History::at_rest(),
-                    material,
                 });
             }
         }
@@ -168,17 +169,16 @@ impl<const D: usize> Simulation<D> {
     /// Advances by [`FRAME_TIME`].
     pub fn advance_frame(&mut self) {
         let (mut fastest, mut sound) = (0.0_f64, 0.0_f64);
-        for particle in &self.particles {
+        for (material, particle) in self.particles_with_material() {
             let square = linalg::dot(&particle.velocity, &particle.velocity);
             assert!(square.is_finite(), "a stable step cannot diverge");
             fastest = fastest.max(square.sqrt());
-            let material = &self.materials[particle.material];
             sound = sound.max(material.sound_speed(&particle.history));
         }
         for bar in &self.obstacles {
             fastest = fastest.max(bar.top_speed());
         }
-        let viscosities = self.materials.iter().map(Material::viscosity);
+        let viscosities = self.materials.iter().map(|(m, _)| m.viscosity());
         let viscosity = viscosities.fold(0.0, f64::max);
         let spacing = self.grid.spacing;
         let longest = f64::min(
@@ -210,11 +210,9 @@ impl<const D: usize> Simulation<D> {
     }
 
     /// GNS's particle types in the order of construction.
-    pub fn particle_types(&self) -> impl ExactSizeIterator<Item = i64> {
-        let material = |particle: &Particle<D>| &self.materials[particle.material];
-        self.particles
-            .iter()
-            .map(move |particle| material(particle).particle_type())
+    pub fn particle_types(&self) -> impl Iterator<Item = i64> {
+        self.particles_with_material()
+            .map(|(material, _)| material.particle_type())
     }
 
     /// The bars that the particles collide with.
@@ -237,15 +235,17 @@ impl<const D: usize> Simulation<D> {
 
     /// Mass of all particles, where water at rest has density 1.
     pub fn mass(&self) -> f64 {
-        self.particles.iter().map(|p| self.mass_of(p)).sum()
+        self.particles_with_material()
+            .map(|(material, _)| self.mass_of(material))
+            .sum()
     }
 
     /// Sum of mass times velocity.
     pub fn momentum(&self) -> [f64; D] {
         let mut momentum = [0.0; D];
-        for (particle, velocity) in self.particles.iter().zip(self.velocities()) {
+        for ((material, _), velocity) in self.particles_with_material().zip(self.velocities()) {
             for axis in 0..D {
-                momentum[axis] += self.mass_of(particle) * velocity[axis];
+                momentum[axis] += self.mass_of(material) * velocity[axis];
             }
         }
         momentum
@@ -255,10 +255,9 @@ impl<const D: usize> Simulation<D> {
     pub fn energy(&self) -> f64 {
         // Inertia of a quadratic spline about its centre (Jiang et al. 2015).
         let inertia = 0.25 * self.grid.spacing.powi(2);
-        self.particles
-            .iter()
+        self.particles_with_material()
             .zip(self.velocities())
-            .map(|(particle, velocity)| {
+            .map(|((material, particle), velocity)| {
                 let spin: f64 = particle
                     .velocity_gradient
                     .iter()
@@ -267,14 +266,22 @@ impl<const D: usize> Simulation<D> {
                 let per_mass = 0.5 * linalg::dot(&velocity, &velocity)
                     + 0.5 * inertia * spin
                     + GRAVITY * (particle.position[1] - self.walls.low)
-                    + self.materials[particle.material].energy(&particle.history);
-                self.mass_of(particle) * per_mass
+                    + material.energy(&particle.history);
+                self.mass_of(material) * per_mass
             })
             .sum()
     }
 
-    fn mass_of(&self, particle: &Particle<D>) -> f64 {
-        self.volume * self.materials[particle.material].density()
+    /// Mass of a particle of this material.
+    fn mass_of(&self, material: &Material) -> f64 {
+        self.volume * material.density()
+    }
+
+    fn particles_with_material(&self) -> impl Iterator<Item = (&Material, &Particle<D>)> {
+        self.materials.iter().flat_map(|(material, range)| {
+            let particles = self.particles[range.clone()].iter();
+            particles.map(move |particle| (material, particle))
+        })
     }
 
     /// Velocities are those of half a step before: a new step moves that moment, between
@@ -305,28 +312,30 @@ impl<const D: usize> Simulation<D> {
 
     fn scatter(&mut self) {
         let stress_scale = -self.step * 4.0 / self.grid.spacing.powi(2);
-        for particle in &mut self.particles {
-            let material = &self.materials[particle.material];
+        for (material, range) in &self.materials {
             let mass = self.volume * material.density();
-            let stress = material.stress(
-                &mut particle.history,
-                &particle.velocity_gradient,
-                self.step,
-            );
-            let mut affine = particle.velocity_gradient;
-            for i in 0..D {
-                for j in 0..D {
-                    affine[i][j] += stress_scale * stress[i][j];
+            for particle in &mut self.particles[range.clone()] {
+                let stress = material.stress(
+                    &mut particle.history,
+                    &particle.velocity_gradient,
+                    self.step,
+                );
+                let mut affine = particle.velocity_gradient;
+                for i in 0..D {
+                    for j in 0..D {
+                        affine[i][j] += stress_scale * stress[i][j];
+                    }
                 }
-            }
-            let stencil = self.grid.stencil(&particle.position);
-            for k in 0..Stencil::<D>::LEN {
-                let node = &mut self.grid.nodes[stencil.nodes[k]];
-                let weighted_mass = stencil.weights[k] * mass;
-                node.mass += weighted_mass;
-                for axis in 0..D {
-                    node.velocity[axis] += weighted_mass
-                        * (particle.velocity[axis] + linalg::dot(&affine[axis], &stencil.arms[k]));
+                let stencil = self.grid.stencil(&particle.position);
+                for k in 0..Stencil::<D>::LEN {
+                    let node = &mut self.grid.nodes[stencil.nodes[k]];
+                    let weighted_mass = stencil.weights[k] * mass;
+                    node.mass += weighted_mass;
+                    for axis in 0..D {
+                        node.velocity[axis] += weighted_mass
+                            * (particle.velocity[axis]
+                                + linalg::dot(&affine[axis], &stencil.arms[k]));
+                    }
                 }
             }
         }
@@ -334,11 +343,13 @@ impl<const D: usize> Simulation<D> {
 
     fn scatter_friction(&mut self) {
         self.frictions.fill(0.0);
-        for particle in &self.particles {
-            let friction = self.materials[particle.material].wall_friction();
-            let stencil = self.grid.stencil(&particle.position);
-            for &node in &stencil.nodes[..Stencil::<D>::LEN] {
-                self.frictions[node] = self.frictions[node].max(friction);
+        for (material, range) in &self.materials {
+            let friction = material.wall_friction();
+            for particle in &self.particles[range.clone()] {
+                let stencil = self.grid.stencil(&particle.position);
+                for &node in &stencil.nodes[..Stencil::<D>::LEN] {
+                    self.frictions[node] = self.frictions[node].max(friction);
+                }
             }
         }
     }
