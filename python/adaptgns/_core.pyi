@@ -107,17 +107,17 @@ def simulate(
     0.0025 s between frames. The first frame is the scene as drawn.
 
     Args:
-        scene: 'waterdrop' or 'sand'.
+        scene: 'waterdrop', 'sand', 'goop', 'jelly', 'multimaterial', 'waterramps' or 'stirrer'.
         seed: any integer from 0 to 2**64 - 1; the result depends on the arguments alone,
             whatever else runs.
         frames: number of frames T, at least 1.
         dim: 2 or 3.
         particles: smallest and largest number of particles, from 16 to as many as fill half
-            the box; None for the published mix.
+            the room for them; None for the published mix. Those of obstacles are not counted.
 
     Returns:
         Positions [T, N, dim], all inside the box, and GNS's particle types [N]: 5 for water,
-        6 for sand.
+        6 for sand, 7 for goop and jelly, 3 for obstacles, which come last.
 
     One thread does the work, with the GIL released: call it from several threads to make
     several trajectories at once.

@@ -32,7 +32,7 @@ class GenerateConfig:
     """
 
     scene: SceneName
-    """What falls into the box: water or sand."""
+    """What falls into the box, and on what; docs/scenes.md shows each."""
     out: Path
     """Folder for train.h5, valid.h5, test.h5 and metadata.json; made if missing."""
     train: int = 1000
@@ -42,13 +42,14 @@ class GenerateConfig:
     test: int = 30
     """Test trajectories; 0 for no such file."""
     frames: int | None = None
-    """Frames per trajectory, 0.0025 s apart; None: 1000 for waterdrop, 320 for sand."""
+    """Frames per trajectory, 0.0025 s apart; None: the scene's own, 320 to 1000."""
     seed: int = 0
     """Seed; more trajectories under the same seed begin with the same ones."""
     dim: Literal[2, 3] = 2
     """Spatial dimensions."""
     particles: tuple[int, int] | None = None
-    """Fewest and most particles of a trajectory; None: the published set's sizes."""
+    """Fewest and most particles of a trajectory, obstacles not counted; None: the published
+    set's sizes."""
 
 
 def generate(config: GenerateConfig, *, console: Console | None = None) -> None:

@@ -19,13 +19,10 @@ from adaptgns import _core
 from adaptgns.atomic import replace_text
 from adaptgns.data.errors import DataError
 from adaptgns.data.generation import SplitPlan, generate_dataset
-from adaptgns.data.scenes import SCENES, SceneName
+from adaptgns.data.scenes import SceneName
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-EMBEDDED: tuple[SceneName, ...] = tuple(SCENES)
-"""Names that stand for a default data set wherever a folder is accepted."""
 
 DEFAULT_SETS: dict[SceneName, dict[str, SplitPlan]] = {
     # Training on small drops fits more steps into the time; what is measured is full size.
@@ -40,6 +37,9 @@ DEFAULT_SETS: dict[SceneName, dict[str, SplitPlan]] = {
         "test": SplitPlan("sand", 30, frames=320, seed=0),
     },
 }
+
+EMBEDDED: tuple[SceneName, ...] = tuple(DEFAULT_SETS)
+"""Names that stand for a default data set wherever a folder is accepted."""
 
 _MANIFEST = "manifest.json"
 _ABANDONED_AFTER = 24 * 3600.0

@@ -48,7 +48,8 @@ class SplitPlan:
         seed: together with the split's name and a trajectory's number it seeds that trajectory,
             so that a shorter split is a prefix of a longer one.
         dim: 2 or 3.
-        particles: fewest and most particles of a trajectory; None for the published sizes.
+        particles: fewest and most particles of a trajectory, obstacles not counted; None for the
+            published sizes.
     """
 
     scene: SceneName
@@ -224,7 +225,7 @@ def _metadata(
         "periodic_boundary_conditions": [False] * plan.dim,
         "kinematic_types": list(GNS_KINEMATIC),
         "material_properties": 0,
-        "default_connectivity_radius": scene.radius,
+        "default_connectivity_radius": scene.radii[plan.dim - 2],
         "sequence_length": plan.frames - 1,
         "num_particles_max": max(int(split.particle_counts.max()) for split in splits.values()),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-SceneName = Literal["waterdrop", "sand"]
+SceneName = Literal["waterdrop", "sand", "goop", "jelly", "multimaterial", "waterramps", "stirrer"]
 
 
 @dataclass(frozen=True)
@@ -13,20 +13,26 @@ class Scene:
     """What every trajectory of a scene has in common.
 
     Attributes:
-        frames: length of the published set's trajectories.
+        frames: length of the published set's trajectories, or one that shows the scene come to
+            rest where there is no such set.
         dt: seconds between frames.
         low, high: the walls, on every axis, in metres.
-        radius: connectivity radius, in metres.
+        radii: connectivity radius in two and in three dimensions, in metres.
     """
 
     frames: int
     dt: float = 0.0025
     low: float = 0.1
     high: float = 0.9
-    radius: float = 0.015
+    radii: tuple[float, float] = (0.015, 0.035)
 
 
 SCENES: dict[SceneName, Scene] = {
     "waterdrop": Scene(frames=1000),
     "sand": Scene(frames=320),
+    "goop": Scene(frames=400),
+    "jelly": Scene(frames=400),
+    "multimaterial": Scene(frames=1000),
+    "waterramps": Scene(frames=600),
+    "stirrer": Scene(frames=600),
 }

@@ -23,7 +23,7 @@ fn simulate<'py>(
     particles: Option<(usize, usize)>,
 ) -> PyResult<Simulated<'py>> {
     let scene = Scene::from_name(scene).map_err(to_python)?;
-    let positions = py
+    let (positions, types) = py
         .detach(|| match dim {
             2 => record::<2>(scene, seed, frames, particles),
             3 => record::<3>(scene, seed, frames, particles),
@@ -33,7 +33,6 @@ fn simulate<'py>(
             }),
         })
         .map_err(to_python)?;
-    let types = vec![scene.particle_type(); positions.shape()[1]];
     Ok((positions.into_pyarray(py), types.into_pyarray(py)))
 }
 
@@ -42,11 +41,13 @@ fn record<const D: usize>(
     seed: u64,
     frames: usize,
     particles: Option<(usize, usize)>,
-) -> Result<Array3<f32>, Error> {
+) -> Result<(Array3<f32>, Vec<i64>), Error> {
     let trajectory = mpm::trajectory::<D>(scene, seed, frames, particles)?;
-    let shape = (frames, trajectory.particles, D);
-    let flat = trajectory.positions.into_flattened();
-    Ok(Array3::from_shape_vec(shape, flat).expect("as many positions as frames and particles"))
+    let types = trajectory.particle_types;
+    let shape = (frames, types.len(), D);
+    let positions = Array3::from_shape_vec(shape, trajectory.positions.into_flattened())
+        .expect("as many positions as frames and particles");
+    Ok((positions, types))
 }
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {

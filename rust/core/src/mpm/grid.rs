@@ -21,7 +21,7 @@ pub struct Walls {
 #[derive(Clone, Copy)]
 pub(crate) struct Node<const D: usize> {
     pub mass: f64,
-    /// Momentum while particles are gathered, velocity after the update.
+    /// Momentum while particles are scattered, velocity after the update.
     pub velocity: [f64; D],
 }
 
@@ -30,6 +30,14 @@ impl<const D: usize> Node<D> {
         mass: 0.0,
         velocity: [0.0; D],
     };
+}
+
+/// Where a node is.
+pub(crate) struct Place<const D: usize> {
+    pub index: usize,
+    pub position: [f64; D],
+    /// Along each axis, -1 or 1 on the low or high wall or beyond, 0 between.
+    pub sides: [f64; D],
 }
 
 /// The nodes around a particle: index, spline weight, and vector from the particle.
@@ -136,22 +144,31 @@ impl<const D: usize> Grid<D> {
         (first, x - first as f64)
     }
 
-    /// Calls `visit` for each node in use with its place along each axis: -1 or 1 on the
-    /// low or high wall or beyond, 0 between.
-    pub(crate) fn for_each_node(&mut self, mut visit: impl FnMut(&mut Node<D>, [f64; D])) {
+    /// Calls `visit` for each node in use.
+    pub(crate) fn for_each_node(&mut self, mut visit: impl FnMut(&mut Node<D>, Place<D>)) {
         if self.active.iter().any(Range::is_empty) {
             return;
         }
+        let (low, spacing) = (self.walls.low, self.spacing);
+        let coordinate = |along: usize| low + (along as f64 - PADDING as f64) * spacing;
         let last = self.active[D - 1].clone();
         let mut index: [usize; D] = std::array::from_fn(|axis| self.active[axis].start);
         loop {
             let row: usize = (0..D - 1)
                 .map(|axis| index[axis] * self.strides[axis])
                 .sum();
+            let mut position = index.map(coordinate);
             let mut sides = index.map(|along| self.sides[along]);
             for along in last.clone() {
+                position[D - 1] = coordinate(along);
                 sides[D - 1] = self.sides[along];
-                visit(&mut self.nodes[row + along], sides);
+                let index = row + along;
+                let place = Place {
+                    index,
+                    position,
+                    sides,
+                };
+                visit(&mut self.nodes[index], place);
             }
             let Some(axis) = (0..D - 1).rfind(|&axis| index[axis] + 1 < self.active[axis].end)
             else {

@@ -27,6 +27,21 @@ pub(crate) fn dot<const D: usize>(a: &[f64; D], b: &[f64; D]) -> f64 {
     (0..D).map(|k| a[k] * b[k]).sum()
 }
 
+/// Determinant of a symmetric positive definite matrix, whose elimination needs no
+/// pivoting.
+pub(crate) fn determinant<const D: usize>(matrix: &Matrix<D>) -> f64 {
+    let mut a = *matrix;
+    for pivot in 0..D {
+        for i in pivot + 1..D {
+            let factor = a[i][pivot] / a[pivot][pivot];
+            for j in pivot..D {
+                a[i][j] -= factor * a[pivot][j];
+            }
+        }
+    }
+    (0..D).map(|k| a[k][k]).product()
+}
+
 /// `a b aᵀ`.
 pub(crate) fn congruence<const D: usize>(a: &Matrix<D>, b: &Matrix<D>) -> Matrix<D> {
     let mut ab = zero();
@@ -104,6 +119,8 @@ mod tests {
                 assert!((gram[i][j] - f64::from(i == j)).abs() < 1e-14, "{matrix:?}");
             }
         }
+        let product: f64 = values.iter().product();
+        assert!((determinant(&matrix) - product).abs() < 1e-14, "{matrix:?}");
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! Constitutive laws. All quantities are per unit of rest density, so that moduli are
-//! squared speeds [m²/s²] and the rest density is 1.
+//! Constitutive laws. Stresses and moduli are per unit of the material's own rest
+//! density, so that they are squared speeds [m²/s²].
 
 use super::linalg::{self, Matrix};
 
@@ -10,16 +10,8 @@ pub enum Material {
     Water(Water),
     /// A dry granular medium.
     Sand(Sand),
-}
-
-/// How a material meets a wall. Both let go of a wall without resistance.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Contact {
-    /// The wall takes the velocity into it, nothing else.
-    Slip,
-    /// The wall also slows the sliding by this coefficient times the velocity taken
-    /// (Coulomb friction).
-    Friction(f64),
+    /// A soft solid.
+    Goop(Goop),
 }
 
 /// Tait's equation of state p = c²/γ ((ρ/ρ₀)^γ − 1) with a Newtonian viscosity.
@@ -51,9 +43,11 @@ pub struct Sand {
     pub lambda: f64,
     /// Shear modulus \[m²/s²\].
     pub mu: f64,
+    /// Density at rest over that of water.
+    pub density: f64,
     /// Angle of internal friction \[rad\].
     pub friction_angle: f64,
-    /// Friction coefficient at the walls.
+    /// Friction coefficient at walls and obstacles.
     pub wall_friction: f64,
     /// Time \[s\] whose product with the divergence of the velocity is the part of the
     /// pressure lost in expansion and added in compression, a bulk viscosity: colliding
@@ -61,12 +55,32 @@ pub struct Sand {
     pub collision_time: f64,
 }
 
+/// A neo-Hookean solid that flows where it is sheared beyond its yield stress (J₂
+/// plasticity by radial return, Simo and Hughes 1998, section 9.3), with the viscosity of
+/// a Kelvin–Voigt solid.
+///
+/// The stored energy is κ/2 (½(J² − 1) − ln J) + μ/2 (tr b̄ − d), where J is the ratio of
+/// volumes and b̄ the elastic left Cauchy–Green tensor without its change of volume.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Goop {
+    /// Bulk modulus κ \[m²/s²\].
+    pub bulk: f64,
+    /// Shear modulus μ \[m²/s²\].
+    pub shear: f64,
+    /// Shear stress that it bears \[m²/s²\]; infinite for a jelly, which never flows.
+    pub yield_stress: f64,
+    /// Kinematic viscosity \[m²/s\].
+    pub viscosity: f64,
+    /// Friction coefficient at walls and obstacles.
+    pub wall_friction: f64,
+}
+
 /// What a material remembers of a particle's past.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct History<const D: usize> {
     /// Sand: elastic left Cauchy–Green tensor b = F Fᵀ. Its eigenvectors are the left
     /// singular vectors of F and its eigenvalues the squared singular values, which is
-    /// all that isotropic return mapping needs.
+    /// all that isotropic return mapping needs. Goop: b̄ = b / (det b)^(1/d).
     left_cauchy_green: Matrix<D>,
     /// Logarithm of the volume over the volume at rest. Sand: of the part gained while
     /// falling apart, which is given back before the material bears load again (the
@@ -81,9 +95,37 @@ impl<const D: usize> History<D> {
             log_volume: 0.0,
         }
     }
+
+    /// The left Cauchy–Green tensor after the velocity gradient has acted for the time `dt`.
+    fn stretched(&self, velocity_gradient: &Matrix<D>, dt: f64) -> Matrix<D> {
+        let mut step = linalg::identity();
+        for i in 0..D {
+            for j in 0..D {
+                step[i][j] += dt * velocity_gradient[i][j];
+            }
+        }
+        linalg::congruence(&step, &self.left_cauchy_green)
+    }
 }
 
 impl Material {
+    /// Number of the material in the data sets of GNS.
+    pub fn particle_type(&self) -> i64 {
+        match self {
+            Self::Water(_) => 5,
+            Self::Sand(_) => 6,
+            Self::Goop(_) => 7,
+        }
+    }
+
+    /// Density at rest over that of water.
+    pub(crate) fn density(&self) -> f64 {
+        match self {
+            Self::Water(_) | Self::Goop(_) => 1.0,
+            Self::Sand(sand) => sand.density,
+        }
+    }
+
     /// Speed of sound \[m/s\] in a particle.
     pub(crate) fn sound_speed<const D: usize>(&self, history: &History<D>) -> f64 {
         match self {
@@ -92,6 +134,7 @@ impl Material {
                 water.sound_speed * (0.5 * (water.exponent - 1.0) * compression).exp()
             }
             Self::Sand(sand) => (sand.lambda + 2.0 * sand.mu).sqrt(),
+            Self::Goop(goop) => goop.sound_speed(history),
         }
     }
 
@@ -101,13 +144,17 @@ impl Material {
         match self {
             Self::Water(water) => water.bulk_viscosity + 2.0 * water.viscosity,
             Self::Sand(_) => 0.0,
+            Self::Goop(goop) => 2.0 * goop.viscosity,
         }
     }
 
-    pub(crate) fn contact(&self) -> Contact {
+    /// Coefficient of Coulomb friction at walls and obstacles, which every material leaves
+    /// without resistance; 0 where they take the velocity into them and nothing else.
+    pub(crate) fn wall_friction(&self) -> f64 {
         match self {
-            Self::Water(_) => Contact::Slip,
-            Self::Sand(sand) => Contact::Friction(sand.wall_friction),
+            Self::Water(_) => 0.0,
+            Self::Sand(sand) => sand.wall_friction,
+            Self::Goop(goop) => goop.wall_friction,
         }
     }
 
@@ -122,6 +169,7 @@ impl Material {
         match self {
             Self::Water(water) => water.stress(history, velocity_gradient, dt),
             Self::Sand(sand) => sand.stress(history, velocity_gradient, dt),
+            Self::Goop(goop) => goop.stress(history, velocity_gradient, dt),
         }
     }
 
@@ -130,6 +178,7 @@ impl Material {
         match self {
             Self::Water(water) => water.energy(history.log_volume),
             Self::Sand(sand) => sand.energy(history),
+            Self::Goop(goop) => goop.energy(history),
         }
     }
 }
@@ -175,13 +224,7 @@ impl Sand {
         velocity_gradient: &Matrix<D>,
         dt: f64,
     ) -> Matrix<D> {
-        let mut step = linalg::identity();
-        for i in 0..D {
-            for j in 0..D {
-                step[i][j] += dt * velocity_gradient[i][j];
-            }
-        }
-        let trial = linalg::congruence(&step, &history.left_cauchy_green);
+        let trial = history.stretched(velocity_gradient, dt);
         let (squares, axes) = linalg::symmetric_eigen(&trial);
         let trial: [f64; D] = squares.map(|square| 0.5 * square.max(f64::MIN_POSITIVE).ln());
         let strain = self.project(trial, &mut history.log_volume);
@@ -229,6 +272,70 @@ impl Sand {
     }
 }
 
+impl Goop {
+    fn stress<const D: usize>(
+        &self,
+        history: &mut History<D>,
+        velocity_gradient: &Matrix<D>,
+        dt: f64,
+    ) -> Matrix<D> {
+        history.log_volume += dt * linalg::trace(velocity_gradient);
+        history.left_cauchy_green = self.project(&history.stretched(velocity_gradient, dt));
+        let mean = linalg::trace(&history.left_cauchy_green) / D as f64;
+        let pressure = -0.5 * self.bulk * ((2.0 * history.log_volume).exp() - 1.0);
+        let mut stress = linalg::zero();
+        for i in 0..D {
+            for j in 0..D {
+                stress[i][j] = self.shear * history.left_cauchy_green[i][j]
+                    + self.viscosity * (velocity_gradient[i][j] + velocity_gradient[j][i]);
+            }
+            stress[i][i] -= self.shear * mean + pressure;
+        }
+        stress
+    }
+
+    /// Return mapping of a trial b: its deviator shrinks to what the yield stress bears, and
+    /// its determinant becomes one.
+    fn project<const D: usize>(&self, trial: &Matrix<D>) -> Matrix<D> {
+        let scale = linalg::determinant(trial).powf(-1.0 / D as f64);
+        let mut isochoric = trial.map(|row| row.map(|x| scale * x));
+        let mean = linalg::trace(&isochoric) / D as f64;
+        let mut square = 0.0;
+        for i in 0..D {
+            for j in 0..D {
+                square += (isochoric[i][j] - mean * f64::from(i == j)).powi(2);
+            }
+        }
+        // Pure shear by the stress τ has a deviator of norm √2 τ.
+        let excess = self.shear * (0.5 * square).sqrt() / self.yield_stress;
+        if excess <= 1.0 {
+            return isochoric;
+        }
+        for i in 0..D {
+            for j in 0..D {
+                let spherical = mean * f64::from(i == j);
+                isochoric[i][j] = spherical + (isochoric[i][j] - spherical) / excess;
+            }
+        }
+        let scale = linalg::determinant(&isochoric).powf(-1.0 / D as f64);
+        isochoric.map(|row| row.map(|x| scale * x))
+    }
+
+    /// Of the stiffer direction of a stretched particle, or faster.
+    fn sound_speed<const D: usize>(&self, history: &History<D>) -> f64 {
+        let stretch = linalg::trace(&history.left_cauchy_green) / D as f64;
+        let volume = history.log_volume.exp().max(1.0);
+        (self.bulk * volume.powi(2) + 2.0 * self.shear * stretch).sqrt()
+    }
+
+    fn energy<const D: usize>(&self, history: &History<D>) -> f64 {
+        let squared_volume = (2.0 * history.log_volume).exp();
+        let stretch = linalg::trace(&history.left_cauchy_green) - D as f64;
+        0.5 * self.bulk * (0.5 * (squared_volume - 1.0) - history.log_volume)
+            + 0.5 * self.shear * stretch
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -243,9 +350,17 @@ mod tests {
     const SAND: Sand = Sand {
         lambda: 350.0,
         mu: 230.0,
+        density: 1.0,
         friction_angle: 0.6,
         wall_friction: 0.4,
         collision_time: 0.0,
+    };
+    const JELLY: Goop = Goop {
+        bulk: 300.0,
+        shear: 50.0,
+        yield_stress: f64::INFINITY,
+        viscosity: 0.0,
+        wall_friction: 0.4,
     };
 
     /// A slow compression along the first axis: the work done is the energy stored.
@@ -268,6 +383,7 @@ mod tests {
     fn stress_is_the_derivative_of_energy() {
         assert_work_is_stored(Material::Water(WATER));
         assert_work_is_stored(Material::Sand(SAND));
+        assert_work_is_stored(Material::Goop(JELLY));
     }
 
     #[test]
@@ -300,5 +416,36 @@ mod tests {
         let strain = SAND.project([-0.01, -0.01], &mut gained);
         assert!((strain[0] + 0.005).abs() < 1e-15);
         assert_eq!(gained, 0.0);
+    }
+
+    #[test]
+    fn jelly_remembers_its_shape_and_goop_keeps_what_it_yielded() {
+        let goop = Goop {
+            yield_stress: 1.0,
+            ..JELLY
+        };
+        let shear = |rate: f64| [[0.0, rate, 0.0], [0.0; 3], [0.0; 3]];
+        for (material, returns) in [(JELLY, true), (goop, false)] {
+            let mut history = History::<3>::at_rest();
+            let mut largest = 0.0_f64;
+            for step in 0..2000 {
+                let rate = if step < 1000 { 1.0 } else { -1.0 };
+                let stress = material.stress(&mut history, &shear(rate), 1e-4);
+                largest = largest.max(stress[0][1]);
+                let volume = linalg::determinant(&history.left_cauchy_green);
+                assert!((volume - 1.0).abs() < 1e-12, "{volume}");
+            }
+            let energy = material.energy(&history);
+            if returns {
+                assert!(
+                    (largest / (0.1 * JELLY.shear) - 1.0).abs() < 0.01,
+                    "{largest}"
+                );
+                assert!(energy < 1e-4, "{energy}");
+            } else {
+                assert!((largest - goop.yield_stress).abs() < 0.01, "{largest}");
+                assert!(energy > 0.9 * 0.5 * goop.yield_stress.powi(2) / goop.shear);
+            }
+        }
     }
 }

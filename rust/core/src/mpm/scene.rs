@@ -1,9 +1,12 @@
-//! Random scenes: blocks of one material thrown into a box.
+//! Random scenes: blocks of matter thrown into a box, on obstacles in some.
+
+use std::f64::consts::PI;
 
 use super::grid::Walls;
-use super::material::{Material, Sand, Water};
+use super::material::{Goop, Material, Sand, Water};
+use super::obstacle::Bar;
 use super::rng::Rng;
-use super::solver::Simulation;
+use super::solver::{Body, Simulation};
 use crate::Error;
 
 /// The box of every scene.
@@ -13,7 +16,7 @@ pub const WALLS: Walls = Walls {
 };
 /// Fewest particles a scene can be asked for.
 const MIN_PARTICLES: usize = 16;
-/// Largest part of the box's volume that a scene can be asked to fill.
+/// Largest part of the room for blocks that a scene can be asked to fill.
 const MAX_FILL: f64 = 0.5;
 /// Tries at placing blocks apart before settling for a single one.
 const MAX_TRIES: usize = 100;
@@ -22,6 +25,40 @@ const COARSENESS: f64 = 2.0;
 /// Largest offset of a particle from its lattice point, in spacings.
 const JITTER: f64 = 0.45;
 
+const WATER: Material = Material::Water(Water {
+    sound_speed: 14.0,
+    exponent: 7.0,
+    viscosity: 0.003,
+    bulk_viscosity: 0.1,
+    cohesion: 0.05,
+});
+const SAND: Material = Material::Sand(Sand {
+    lambda: 350.0,
+    mu: 230.0,
+    // Wet sand's, which sinks in water; alone, sand moves the same at any density, and a
+    // power of two leaves even the rounding as it is.
+    density: 2.0,
+    friction_angle: 35.0_f64.to_radians(),
+    wall_friction: 0.4,
+    collision_time: 0.01,
+});
+/// Keeps the shape that an impact gives it.
+const GOOP: Material = Material::Goop(Goop {
+    bulk: 300.0,
+    shear: 100.0,
+    yield_stress: 2.0,
+    viscosity: 0.02,
+    wall_friction: 0.5,
+});
+/// Springs back and wobbles.
+const JELLY: Material = Material::Goop(Goop {
+    bulk: 200.0,
+    shear: 25.0,
+    yield_stress: f64::INFINITY,
+    viscosity: 0.02,
+    wall_friction: 0.3,
+});
+
 /// A family of random scenes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scene {
@@ -29,12 +66,26 @@ pub enum Scene {
     WaterDrop,
     /// One to three blocks of sand.
     Sand,
+    /// One to three blocks of goop, a soft plastic solid.
+    Goop,
+    /// One or two blocks of jelly, a soft elastic solid.
+    Jelly,
+    /// Two to four blocks of water, sand and goop in turn.
+    MultiMaterial,
+    /// One or two blocks of water above one to three ramps.
+    WaterRamps,
+    /// One or two blocks of water above a paddle that turns and swings.
+    Stirrer,
 }
 
 /// What is drawn for a scene, at the resolution of its published counterpart.
 struct Recipe {
-    material: Material,
-    particle_type: i64,
+    /// What the blocks are made of, in turn from a random one on.
+    materials: &'static [Material],
+    /// Draws the obstacles; given the least thickness that keeps their two sides apart.
+    obstacles: fn(&mut Rng, f64) -> Vec<Bar>,
+    /// Height \[m\] above which the blocks begin, and below which obstacles stay.
+    ground: f64,
     /// Distance of particles \[m\], in 2D and 3D.
     spacing: [f64; 2],
     /// Range of the number of particles, in 2D and 3D.
@@ -58,8 +109,15 @@ struct Block<const D: usize> {
 
 impl Scene {
     /// Every scene, with its name.
-    pub const ALL: [(&'static str, Self); 2] =
-        [("waterdrop", Self::WaterDrop), ("sand", Self::Sand)];
+    pub const ALL: [(&'static str, Self); 7] = [
+        ("waterdrop", Self::WaterDrop),
+        ("sand", Self::Sand),
+        ("goop", Self::Goop),
+        ("jelly", Self::Jelly),
+        ("multimaterial", Self::MultiMaterial),
+        ("waterramps", Self::WaterRamps),
+        ("stirrer", Self::Stirrer),
+    ];
 
     /// The scene of this name.
     ///
@@ -83,17 +141,12 @@ impl Scene {
             })
     }
 
-    /// Particle type in the convention of GNS.
-    pub fn particle_type(self) -> i64 {
-        self.recipe().particle_type
-    }
-
     /// Draws the scene of a seed, with a number of particles in `particles` (both ends
-    /// included) or as many as its published counterpart has.
+    /// included, obstacles not counted) or as many as its published counterpart has.
     ///
     /// # Errors
     ///
-    /// If `particles` is empty, too small for a block or too large for the box.
+    /// If `particles` is empty, too small for a block or too large for the room.
     pub fn draw<const D: usize>(
         self,
         seed: u64,
@@ -102,7 +155,9 @@ impl Scene {
         let recipe = self.recipe();
         let spacing = recipe.spacing[D - 2];
         let (low, high) = particles.unwrap_or(recipe.particles[D - 2]);
-        let most = (MAX_FILL * ((WALLS.high - WALLS.low) / spacing).powi(D as i32)) as usize;
+        let most = (MAX_FILL
+            * ((WALLS.high - WALLS.low) / spacing).powi(D as i32 - 1)
+            * ((WALLS.high - recipe.ground) / spacing)) as usize;
         if !(MIN_PARTICLES <= low && low <= high && high <= most) {
             return Err(Error::invalid(
                 "particles",
@@ -114,60 +169,125 @@ impl Scene {
         let mut rng = Rng::new(seed, self as u64 * 2 + D as u64);
         let count = rng.integer(low, high);
         let blocks = draw_blocks::<D>(&mut rng, &recipe, count);
-        let particles: Vec<_> = blocks
-            .iter()
-            .flat_map(|block| fill(&mut rng, block, spacing))
-            .collect();
-        let mut simulation = Simulation::new(
-            recipe.material,
-            WALLS,
-            spacing,
-            COARSENESS * spacing,
-            particles,
-        )?;
+        let obstacles = (recipe.obstacles)(&mut rng, 2.0 * COARSENESS * spacing);
+        let first = match recipe.materials.len() {
+            1 => 0,
+            several => rng.integer(0, several - 1),
+        };
+        let body = |(index, block)| Body {
+            material: recipe.materials[(first + index) % recipe.materials.len()],
+            particles: fill(&mut rng, block, spacing),
+        };
+        let bodies = blocks.iter().enumerate().map(body).collect();
+        let mut simulation =
+            Simulation::new(WALLS, spacing, COARSENESS * spacing, bodies, obstacles)?;
         // Otherwise the pairs that the jitter brought together would part in flight.
         simulation.separate_fully();
         Ok(simulation)
     }
 
-    /// Chosen so that 30 scenes have the published statistics of their counterparts
-    /// (`benchmarks/generate.py` compares them).
+    /// Water's and sand's are chosen so that 30 scenes have the published statistics of
+    /// their counterparts (`benchmarks/generate.py` compares them).
     fn recipe(self) -> Recipe {
+        let water = Recipe {
+            materials: &[WATER],
+            obstacles: |_, _| Vec::new(),
+            ground: WALLS.low,
+            spacing: [0.0102, 0.025],
+            particles: [(220, 914), (1000, 6000)],
+            blocks: &[0.8, 0.2],
+            aspect: 1.6,
+            sideways: (-0.5, 0.5),
+            upwards: (-0.5, 0.5),
+        };
+        let sand = Recipe {
+            materials: &[SAND],
+            spacing: [0.009, 0.025],
+            particles: [(400, 2140), (2000, 8000)],
+            blocks: &[0.4, 0.3, 0.3],
+            aspect: 2.0,
+            sideways: (-3.0, 3.0),
+            upwards: (-3.5, 0.5),
+            ..water
+        };
         match self {
-            Self::WaterDrop => Recipe {
-                material: Material::Water(Water {
-                    sound_speed: 14.0,
-                    exponent: 7.0,
-                    viscosity: 0.003,
-                    bulk_viscosity: 0.1,
-                    cohesion: 0.05,
-                }),
-                particle_type: 5,
-                spacing: [0.0102, 0.025],
-                particles: [(220, 914), (1000, 6000)],
-                blocks: &[0.8, 0.2],
-                aspect: 1.6,
-                sideways: (-0.5, 0.5),
-                upwards: (-0.5, 0.5),
+            Self::WaterDrop => water,
+            Self::Sand => sand,
+            Self::Goop => Recipe {
+                materials: &[GOOP],
+                sideways: (-1.5, 1.5),
+                ..sand
             },
-            Self::Sand => Recipe {
-                material: Material::Sand(Sand {
-                    lambda: 350.0,
-                    mu: 230.0,
-                    friction_angle: 35.0_f64.to_radians(),
-                    wall_friction: 0.4,
-                    collision_time: 0.01,
-                }),
-                particle_type: 6,
-                spacing: [0.009, 0.025],
-                particles: [(400, 2140), (2000, 8000)],
-                blocks: &[0.4, 0.3, 0.3],
-                aspect: 2.0,
-                sideways: (-3.0, 3.0),
-                upwards: (-3.5, 0.5),
+            Self::Jelly => Recipe {
+                materials: &[JELLY],
+                particles: [(300, 1200), (1000, 6000)],
+                blocks: &[0.5, 0.5],
+                sideways: (-1.5, 1.5),
+                upwards: (-2.0, 0.5),
+                ..water
+            },
+            Self::MultiMaterial => Recipe {
+                materials: &[WATER, SAND, GOOP],
+                particles: [(600, 1800), (2000, 5000)],
+                blocks: &[0.0, 0.25, 0.5, 0.25],
+                sideways: (-1.5, 1.5),
+                upwards: (-2.0, 0.5),
+                ..water
+            },
+            Self::WaterRamps => Recipe {
+                obstacles: ramps,
+                ground: 0.6,
+                particles: [(300, 1100), (1000, 5000)],
+                blocks: &[0.6, 0.4],
+                ..water
+            },
+            Self::Stirrer => Recipe {
+                obstacles: paddle,
+                ground: 0.5,
+                particles: [(400, 1400), (1500, 6000)],
+                blocks: &[0.6, 0.4],
+                ..water
             },
         }
     }
+}
+
+/// One to three inclined bars side by side, longer than thick, with room for matter to pass
+/// on both sides of each and beneath.
+fn ramps(rng: &mut Rng, thickness: f64) -> Vec<Bar> {
+    const LONGEST: f64 = 0.36;
+    const GAP: f64 = 0.1;
+    let width = WALLS.high - WALLS.low;
+    let most = (width / (GAP + 2.0 * thickness)) as usize;
+    let number = rng.integer(1, most.min(3));
+    let slot = width / number as f64;
+    (0..number)
+        .map(|index| {
+            let steepness = rng.uniform(15.0_f64.to_radians(), 40.0_f64.to_radians());
+            let angle = steepness.copysign(rng.uniform(-1.0, 1.0));
+            let length = (slot - GAP).min(LONGEST) * rng.uniform(0.75, 1.0);
+            let room = slot - GAP - length;
+            let left = WALLS.low + slot * index as f64 + 0.5 * GAP;
+            let centre = [
+                left + 0.5 * length + rng.uniform(0.0, room),
+                rng.uniform(0.3, 0.42),
+            ];
+            Bar::fixed(centre, [0.5 * length, 0.5 * thickness], angle)
+        })
+        .collect()
+}
+
+/// A bar that turns either way and swings sideways, low enough to dip into a pool.
+fn paddle(rng: &mut Rng, thickness: f64) -> Vec<Bar> {
+    let spin = rng.uniform(3.0, 8.0);
+    vec![Bar {
+        centre: [rng.uniform(0.42, 0.58), 0.31],
+        half: [rng.uniform(0.12, 0.17), 0.5 * thickness],
+        angle: rng.uniform(0.0, PI),
+        spin: spin.copysign(rng.uniform(-1.0, 1.0)),
+        swing: [rng.uniform(0.0, 0.1), 0.0],
+        period: rng.uniform(1.0, 2.0),
+    }]
 }
 
 /// Blocks that lie inside the box and apart from each other.
@@ -185,7 +305,7 @@ fn draw_blocks<const D: usize>(rng: &mut Rng, recipe: &Recipe, count: usize) -> 
                 (share * rng.uniform(0.7, 1.3)) as usize
             };
             left -= particles;
-            blocks.push(draw_block(rng, recipe, particles));
+            blocks.push(draw_block(rng, recipe, particles, 1.0));
         }
         let inside = |block: &Block<D>| {
             (0..D).all(|axis| block.low[axis] + block.size[axis] <= WALLS.high - 0.5 * spacing)
@@ -202,12 +322,13 @@ fn draw_blocks<const D: usize>(rng: &mut Rng, recipe: &Recipe, count: usize) -> 
             return blocks;
         }
     }
-    // A cube of every volume that is accepted fits.
-    let cube = Recipe {
+    // A block of the room's own proportions fits with every volume that is accepted.
+    let proportionate = Recipe {
         aspect: 1.0,
         ..*recipe
     };
-    vec![draw_block(rng, &cube, count)]
+    let height = (WALLS.high - recipe.ground) / (WALLS.high - WALLS.low);
+    vec![draw_block(rng, &proportionate, count, height)]
 }
 
 /// Number of blocks, of which `probabilities[k]` is that of k + 1.
@@ -222,20 +343,28 @@ fn draw_number(rng: &mut Rng, probabilities: &[f64]) -> usize {
     probabilities.len()
 }
 
-/// A block of `particles` at rest density, inside the box where it fits.
-fn draw_block<const D: usize>(rng: &mut Rng, recipe: &Recipe, particles: usize) -> Block<D> {
+/// A block of `particles` at rest density, inside the room where it fits, whose height over
+/// its width is `height` on average.
+fn draw_block<const D: usize>(
+    rng: &mut Rng,
+    recipe: &Recipe,
+    particles: usize,
+    height: f64,
+) -> Block<D> {
     let spacing = recipe.spacing[D - 2];
     let stretch = 0.5 * recipe.aspect.ln();
-    let stretch: [f64; D] = std::array::from_fn(|_| rng.uniform(-stretch, stretch));
+    let mut stretch: [f64; D] = std::array::from_fn(|_| rng.uniform(-stretch, stretch));
+    stretch[1] += height.ln();
     let mean = stretch.iter().sum::<f64>() / D as f64;
     let side = spacing * (particles as f64).powf(1.0 / D as f64);
     // Whole rows across, and along the first axis whatever length gives the volume.
     let mut size = stretch.map(|s| (side * (s - mean).exp() / spacing).round().max(1.0) * spacing);
     let rows: f64 = size[1..].iter().map(|length| length / spacing).product();
     size[0] = particles as f64 * spacing / rows;
-    let low = size.map(|length| {
-        let room = (WALLS.high - WALLS.low - spacing - length).max(0.0);
-        WALLS.low + 0.5 * spacing + rng.uniform(0.0, room)
+    let low = std::array::from_fn(|axis| {
+        let start = if axis == 1 { recipe.ground } else { WALLS.low };
+        let room = (WALLS.high - start - spacing - size[axis]).max(0.0);
+        start + 0.5 * spacing + rng.uniform(0.0, room)
     });
     let velocity = std::array::from_fn(|axis| {
         let (low, high) = if axis == 1 {
