@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import resource
 import statistics
 import subprocess
 import sys
@@ -123,22 +122,32 @@ def peak_memory(size: str, form: str) -> float:
 def print_memory(size: str, form: str) -> None:
     case = Case(size)
     torch.linalg.norm(torch.randn(500, 500) @ torch.randn(500, 500))  # libraries are loaded
-    before = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    before = resident("VmRSS")
     case.step(form)
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10 - before / 2**20)
+    print(resident("VmHWM") - before)
+
+
+def resident(what: str) -> float:
+    """A figure of this process's memory, in MiB."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(what + ":"):
+            return int(line.split()[1]) / 2**10
+    raise RuntimeError(f"{what}: not told by this system")
 
 
 def measure(rounds: int) -> dict[str, object]:
     results = {}
     for size in SIZES:
         case = Case(size)
-        exact = case.outputs("plain")
+        with torch.inference_mode():
+            exact = case.outputs("plain")
         rounds_here = max(3, rounds // 5) if case.nodes.shape[0] > 5_000 else rounds
         forward = medians({form: partial(case.forward, form) for form in FORMS}, rounds_here)
         step = medians({form: partial(case.step, form) for form in FORMS}, rounds_here)
         rows = {}
         for form in FORMS:
-            outputs = case.outputs(form)
+            with torch.inference_mode():
+                outputs = case.outputs(form)
             off = [float((a - b).norm() / b.norm()) for a, b in zip(outputs, exact, strict=True)]
             rows[form] = {
                 "forward_ms": forward[form],
