@@ -46,8 +46,9 @@ class InteractionLayer(nn.Module):
     sum of maps of its parts, so the node parts are multiplied once per node, not once per edge.
     """
 
-    def __init__(self, latent: int, hidden_layers: int) -> None:
+    def __init__(self, latent: int, hidden_layers: int, *, legacy_edges: bool = False) -> None:
         super().__init__()
+        self.legacy_edges = legacy_edges
         self.edge_mlp = mlp(3 * latent, latent, hidden_layers, latent, norm=True)
         self.node_mlp = mlp(2 * latent, latent, hidden_layers, latent, norm=True)
 
@@ -62,7 +63,7 @@ class InteractionLayer(nn.Module):
         messages = self.edge_mlp[1:](hidden)
         incoming = sum_at_receivers(messages, graph)  # [N, L]
         update = self.node_mlp(torch.cat([incoming, nodes], dim=1))
-        return nodes + update, edges + messages
+        return nodes + update, edges + (edges if self.legacy_edges else messages)
 
 
 class EncodeProcessDecode(nn.Module):
@@ -83,6 +84,7 @@ class EncodeProcessDecode(nn.Module):
         steps: int,
         edges: bool,
         variance: bool,
+        legacy_edges: bool = False,
     ) -> None:
         super().__init__()
         self.node_encoder = mlp(node_features, latent, hidden_layers, latent, norm=True)
@@ -90,7 +92,7 @@ class EncodeProcessDecode(nn.Module):
             mlp(edge_features, latent, hidden_layers, latent, norm=True) if edges else None
         )
         self.layers = nn.ModuleList(
-            InteractionLayer(latent, hidden_layers)
+            InteractionLayer(latent, hidden_layers, legacy_edges=legacy_edges)
             if edges
             else mlp(latent, latent, hidden_layers, latent, norm=True)
             for _ in range(steps)
