@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import (
@@ -231,11 +230,14 @@ def _write_metadata(folder: Path, content: dict[str, Any], suffix: str) -> list[
     write_metadata(folder, section)
     metadata = read_metadata(folder)  # computes missing statistics
     section = json.loads((folder / FILE_NAME).read_bytes())
-    lengths = np.concatenate([open_split(folder, split).lengths for split in SPELLINGS
-                              if find_split(folder, split)])  # fmt: skip
+    lengths = [
+        set(open_split(folder, split).lengths.tolist())
+        for split in SPELLINGS
+        if find_split(folder, split)
+    ]
     notes = []
     if suffix == ".npz":
-        section |= _for_geoelements(metadata, lengths.tolist())
+        section |= _for_geoelements(metadata, sorted(set.union(*lengths)))
         if not set(metadata.kinematic_types) <= set(GNS_KINEMATIC):
             notes.append(
                 f"particles of types {list(metadata.kinematic_types)} are kinematic here; "
@@ -249,7 +251,7 @@ def _write_metadata(folder: Path, content: dict[str, Any], suffix: str) -> list[
             "periodic_boundary_conditions": list(metadata.periodic),
             "kinematic_types": list(metadata.kinematic_types),
         } | section | counts(folder)  # fmt: skip
-        if len(set(lengths.tolist())) > 1:
+        if any(len(of_split) > 1 for of_split in lengths):
             notes.append(
                 "LagrangeBench takes all trajectories of a split to be as long as its first one"
             )
@@ -265,7 +267,7 @@ def _write_metadata(folder: Path, content: dict[str, Any], suffix: str) -> list[
 def _for_geoelements(metadata: Metadata, lengths: list[int]) -> dict[str, Any]:
     """Its rollouts need the exact number of frames, or null where it differs; its network takes
     its input sizes from here where there is a material property."""
-    own: dict[str, Any] = {"sequence_length": lengths[0] if len(set(lengths)) == 1 else None}
+    own: dict[str, Any] = {"sequence_length": lengths[0] if len(lengths) == 1 else None}
     if metadata.material_properties:
         own["nnode_in"] = 7 * metadata.dim + 16 + metadata.material_properties
         own["nedge_in"] = metadata.dim + 1

@@ -111,7 +111,10 @@ class NpzSource:
         except FileNotFoundError:
             raise DataError(f"{self.path}: there is no such file") from None
         except _DAMAGE as error:
-            raise DataError(f"{self.path}: not a readable npz (zip) file: {error}") from error
+            raise DataError(
+                f"{self.path}: not a readable npz (zip) file of {self.path.stat().st_size} bytes: "
+                f"{error}; copy or download it again"
+            ) from error
         with archive:
             yield archive
 
@@ -141,8 +144,10 @@ class NpzSource:
             except restricted_pickle.RefusedPickleError as error:
                 raise DataError(f"{where}: refused, since it asks for {error}") from None
             except _DAMAGE as error:
+                offset = archive.getinfo(name).header_offset
                 raise DataError(
-                    f"{where}: damaged or truncated: {type(error).__name__}: {error}"
+                    f"{where} (at byte {offset}): damaged or truncated: {type(error).__name__}: "
+                    f"{error}; copy or download it again"
                 ) from error
 
     def _load(self, name: str) -> Any:
