@@ -410,6 +410,8 @@ def test_wrong_frames_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str
     path.write_bytes(whole)
     run(folder, tmp_path / "solid.h5", "--dim", "3")
     assert open_split_dim(tmp_path / "solid.h5") == 3
+    run(folder, tmp_path / "flat.h5", "--dim", "2")
+    assert open_split_dim(tmp_path / "flat.h5") == 2
     (folder / "f_04.ply").write_bytes(whole)
     assert "the same frame number as" in refusal(capsys, folder, out)
     (folder / "f_04.ply").rename(folder / "last.ply")

@@ -26,7 +26,7 @@ def sources() -> None:
     meshio = pytest.importorskip("meshio")
     Path("frames").mkdir()
     for frame in range(7):
-        meshio.Mesh(np.full((4, 3), 0.1 * frame), []).write(f"frames/{frame}.ply")
+        meshio.Mesh(np.full((4, 3), 0.1 + 0.1 * frame), []).write(f"frames/{frame}.ply")
     Path("DeepMind/WaterDrop").mkdir(parents=True)
     metadata = read_metadata(Path("my_data"))
     one = Trajectory("", np.random.default_rng(0).random((9, 5, 2), np.float32), np.zeros(5, int))

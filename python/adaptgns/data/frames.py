@@ -50,7 +50,8 @@ class FrameFolders:
     """
 
     def __init__(self, path: Path, *, dim: Literal[2, 3] | None = None) -> None:
-        """With `dim` None, a trajectory is two-dimensional if z is 0 in its first frame.
+        """With `dim` None, a trajectory is two-dimensional if z is 0 in its first frame;
+        with 2, z is left out.
 
         Raises:
             DataError: there are no frames.
@@ -72,6 +73,7 @@ class FrameFolders:
 def _trajectory(folder: Path, dim: int | None) -> Trajectory:
     paths = _ordered(folder)
     first = _read(paths[0])
+    guessed = dim is None
     dim = dim or (3 if first.points[:, 2].any() else 2)
     particles = len(first.points)
     check_shape(Shape(folder.name, len(paths), particles, dim), str(folder))
@@ -79,8 +81,10 @@ def _trajectory(folder: Path, dim: int | None) -> Trajectory:
     for frame, path in enumerate(paths):
         snapshot = first if frame == 0 else _read(path)
         _check_alike(snapshot, first, path, paths[0])
-        if dim == 2 and snapshot.points[:, 2].any():
-            raise DataError(f"{path}: z isn't 0, as it is in {paths[0].name}; say --dim 2 or 3")
+        if guessed and dim == 2 and snapshot.points[:, 2].any():
+            raise DataError(
+                f"{path}: z isn't 0, as it is in {paths[0].name}; say --dim 3, or --dim 2 to leave z out"
+            )
         positions[frame] = snapshot.points[:, :dim]
     where = str(folder)
     types = particle_types(first.types, particles, where)
