@@ -70,7 +70,7 @@ def test_layout_is_that_of_lagrangebench_s_own_file(shared: Path, tmp_path: Path
 def test_periodic_data_trains_and_rolls_out(shared: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     train(["--preset", "smoke", "--data", str(shared / "data" / "lagrangebench_lj3d"),
-           "--out", str(out), "--steps", "5", "--noise", "1e-3", "--test-horizon", "20"])  # fmt: skip
+           "--out", str(out), "--steps", "5", "--test-horizon", "20"])  # fmt: skip
     with h5py.File(out / "rollouts" / "fixed.h5") as file:
         predicted = file["00000/predicted"][()]
     assert predicted.shape == (20, 3, 3)

@@ -83,7 +83,8 @@ def _trajectory(folder: Path, dim: int | None) -> Trajectory:
         _check_alike(snapshot, first, path, paths[0])
         if guessed and dim == 2 and snapshot.points[:, 2].any():
             raise DataError(
-                f"{path}: z isn't 0, as it is in {paths[0].name}; say --dim 3, or --dim 2 to leave z out"
+                f"{path}: z isn't 0, as it is in {paths[0].name}; say --dim 3, or --dim 2 to "
+                "leave z out"
             )
         positions[frame] = snapshot.points[:, :dim]
     where = str(folder)
