@@ -10,6 +10,7 @@ COMMANDS = {
     "rollout": "step a trained model forward over a split",
     "evaluate": "metrics and tables of rollouts",
     "generate": "make a data set with the embedded solver",
+    "convert": "data sets and checkpoints from and to other formats",
     "inspect": "graph statistics, advice on the radius, problems of a data set",
     "plot": "animate a rollout",
 }

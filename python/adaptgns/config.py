@@ -24,6 +24,7 @@ Loss = Literal["nll", "beta-nll", "mse"]
 Preset = Literal["smoke", "laptop", "paper"]
 PolicyName = Literal["fixed", "adaptive", "two-pass", "random", "knn"]
 Device = Literal["auto", "cpu", "cuda"]
+EdgeUpdate = Literal["fixed", "legacy"]
 
 Range = tuple[str, Callable[[float], bool]]
 """What is accepted, in words and as a test; NaN fails them all."""
@@ -67,6 +68,10 @@ class ModelConfig:
     velocity of their ends and its part along the edge."""
     walls: bool = False
     """Hold particles inside the bounds of open axes, as solid walls do."""
+
+    edge_update: EdgeUpdate = "fixed"
+    """What each step leaves of the edges' latents: fixed adds the messages; legacy doubles them, as
+    geoelements/gns did before its pull request 94 (December 2024)."""
 
     def __post_init__(self) -> None:
         _require(self, latent=COUNT, hidden_layers=COUNT, steps=COUNT, radius=POSITIVE)

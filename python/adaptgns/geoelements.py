@@ -1,4 +1,4 @@
-"""Checkpoints of geoelements/gns, read into a :class:`Simulator`.
+"""Checkpoints of geoelements/gns, read into a :class:`Simulator` and written from one.
 
 Its ``state_dict`` holds the same network under other names.
 """
@@ -6,14 +6,16 @@ Its ``state_dict`` holds the same network under other names.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from adaptgns.atomic import written_whole
 from adaptgns.checkpoint import CheckpointError
-from adaptgns.config import ModelConfig
-from adaptgns.data.metadata import Metadata
+from adaptgns.config import HISTORY, TYPE_EMBEDDING, EdgeUpdate, ModelConfig
+from adaptgns.data.metadata import GNS_KINEMATIC, Metadata
 from adaptgns.simulator import Simulator
 
 _ROOT = "_encode_process_decode."
@@ -51,12 +53,15 @@ def _our_name(name: str, linears: int) -> str:
     return re.sub(r"NN-(\d+)\.", lambda m: f"{2 * int(m[1])}.", ours)
 
 
-def read_geoelements(path: Path, metadata: Metadata, *, noise: float = 6.7e-4) -> Simulator:
+def read_geoelements(
+    path: Path, metadata: Metadata, *, noise: float = 6.7e-4, edge_update: EdgeUpdate = "fixed"
+) -> Simulator:
     """The simulator of a geoelements/gns checkpoint (``model-*.pt``, a ``state_dict``).
 
     ``metadata`` is that of the data it was trained on, and ``noise`` its training noise (length
-    per frame), which widened the normalization. No pickled code is run. Raises
-    :class:`CheckpointError` for a file that is something else.
+    per frame), which widened the normalization. ``edge_update`` is legacy for a model trained
+    before its pull request 94 (December 2024): the file doesn't tell. No pickled code is run.
+    Raises :class:`CheckpointError` for a file that is something else.
     """
     try:
         theirs: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
@@ -67,7 +72,12 @@ def read_geoelements(path: Path, metadata: Metadata, *, noise: float = 6.7e-4) -
             latent=theirs[_ROOT + "_decoder.node_fn.NN-0.weight"].shape[1],
             hidden_layers=len(decoder) - 1,
             steps=len(layers),
+            edge_update=edge_update,
         )
+        # One material property at most, which its metadata may not tell.
+        inputs = theirs[_ROOT + "_encoder.node_fn.0.NN-0.weight"].shape[1]
+        if inputs == (HISTORY - 1 + 2) * metadata.dim + TYPE_EMBEDDING + 1:
+            metadata = replace(metadata, material_properties=1)
         simulator = Simulator(config, metadata, noise=noise, variance=False)
         simulator.load_state_dict(ours)
     except Exception as error:
@@ -76,3 +86,58 @@ def read_geoelements(path: Path, metadata: Metadata, *, noise: float = 6.7e-4) -
             f"({type(error).__name__}: {error})"
         ) from error
     return simulator.eval()
+
+
+def write_geoelements(path: Path, simulator: Simulator) -> None:
+    """Write the ``state_dict`` that geoelements/gns loads for the same accelerations; the variance
+    head, which it doesn't have, is left out.
+
+    Raises :class:`CheckpointError`, naming the option, for a model that it can't express.
+    """
+    refusal = _difference(simulator)
+    if refusal is not None:
+        raise CheckpointError(f"{path}: geoelements/gns has no such model: {refusal}")
+    ours = simulator.state_dict()
+    linears = simulator.config.hidden_layers + 1
+    names = _their_names(simulator.config, linears)
+    theirs = {name: ours[_our_name(name, linears)].detach().cpu().clone() for name in names}
+    with written_whole(path) as partial:
+        torch.save(theirs, partial)
+
+
+def _difference(simulator: Simulator) -> str | None:
+    """The first option that geoelements/gns can't follow, in words."""
+    metadata, config = simulator.metadata, simulator.config
+    accepted = ModelConfig(
+        latent=config.latent,
+        hidden_layers=config.hidden_layers,
+        steps=config.steps,
+        radius=config.radius,
+        edge_update=config.edge_update,
+    )
+    for name, value in vars(accepted).items():
+        if getattr(config, name) != value:
+            return f"model.{name} is {getattr(config, name)}; {value} is accepted"
+    if any(metadata.periodic):
+        return f"periodic is {list(metadata.periodic)}; open axes are accepted"
+    if not set(metadata.kinematic_types) <= set(GNS_KINEMATIC):
+        return f"kinematic_types are {list(metadata.kinematic_types)}; only 3 is accepted"
+    if metadata.material_properties > 1:
+        return f"material_properties is {metadata.material_properties}; 0 and 1 are accepted"
+    return None
+
+
+def _their_names(config: ModelConfig, linears: int) -> list[str]:
+    """The peer's tensor names, in its order."""
+
+    def mlp(prefix: str) -> list[str]:
+        return [f"{prefix}NN-{i}.{kind}" for i in range(linears) for kind in ("weight", "bias")]
+
+    def normed(prefix: str) -> list[str]:
+        return [*mlp(f"{prefix}.0."), f"{prefix}.1.weight", f"{prefix}.1.bias"]
+
+    blocks = ["_encoder.node_fn", "_encoder.edge_fn"]
+    for layer in range(config.steps):
+        blocks += [f"_processor.gnn_stacks.{layer}.{kind}_fn" for kind in ("node", "edge")]
+    inner = [name for block in blocks for name in normed(block)] + mlp("_decoder.node_fn.")
+    return ["_particle_type_embedding.weight", *(_ROOT + name for name in inner)]

@@ -47,8 +47,9 @@ class InteractionLayer(nn.Module):
     sum of maps of its parts, so the node parts are multiplied once per node, not once per edge.
     """
 
-    def __init__(self, latent: int, hidden_layers: int) -> None:
+    def __init__(self, latent: int, hidden_layers: int, *, legacy_edges: bool = False) -> None:
         super().__init__()
+        self.legacy_edges = legacy_edges
         self.edge_mlp = mlp(3 * latent, latent, hidden_layers, latent, norm=True)
         self.node_mlp = mlp(2 * latent, latent, hidden_layers, latent, norm=True)
 
@@ -63,7 +64,7 @@ class InteractionLayer(nn.Module):
         messages = self.edge_mlp[1:](hidden)
         incoming = sum_at_receivers(messages, graph)  # [N, L]
         update = self.node_mlp(torch.cat([incoming, nodes], dim=1))
-        return nodes + update, edges + messages
+        return nodes + update, edges + (edges if self.legacy_edges else messages)
 
 
 class EncodeProcessDecode(nn.Module):
@@ -84,14 +85,16 @@ class EncodeProcessDecode(nn.Module):
         steps: int,
         edges: bool,
         variance: bool,
+        legacy_edges: bool = False,
     ) -> None:
         super().__init__()
+        self.legacy_edges = legacy_edges
         self.node_encoder = mlp(node_features, latent, hidden_layers, latent, norm=True)
         self.edge_encoder = (
             mlp(edge_features, latent, hidden_layers, latent, norm=True) if edges else None
         )
         self.layers = nn.ModuleList(
-            InteractionLayer(latent, hidden_layers)
+            InteractionLayer(latent, hidden_layers, legacy_edges=legacy_edges)
             if edges
             else mlp(latent, latent, hidden_layers, latent, norm=True)
             for _ in range(steps)
@@ -103,7 +106,7 @@ class EncodeProcessDecode(nn.Module):
         self, node_features: Tensor, edge_features: Tensor | None, graph: Graph | None
     ) -> Prediction:
         """Predictions for ``node_features`` ``[N, :]`` and ``edge_features`` ``[E, :]``."""
-        if fused.applies(node_features):
+        if fused.applies(node_features) and not self.legacy_edges:
             acceleration, *variances = fused.network(
                 self._perceptrons(), node_features, edge_features, graph, heads=len(self._heads())
             )

@@ -51,6 +51,7 @@ class Simulator(nn.Module):
             steps=config.steps,
             edges=config.edges,
             variance=variance,
+            legacy_edges=config.edge_update == "legacy",
         )
 
         def constant(name: str, values: object) -> None:

@@ -16,7 +16,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from adaptgns.data import restricted_pickle
-from adaptgns.data.cache import TrajectoryCache
+from adaptgns.data.cache import CACHE_BYTES, TrajectoryCache
 from adaptgns.data.errors import DataError
 from adaptgns.data.trajectory import (
     Shape,
@@ -61,8 +61,9 @@ class NpzSource:
     is one pickle and can only be read, and held, whole.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, cache_bytes: int = CACHE_BYTES) -> None:
         self.path = path
+        self._cache_bytes = cache_bytes
         with self._archive() as archive:
             members = [name for name in archive.namelist() if name.endswith(".npy")]
         if not members:
@@ -92,7 +93,7 @@ class NpzSource:
         return 0 if first.material_property is None else first.material_property.shape[1]
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = {"path", "shapes", "_bundled", "_members"}
+        kept = {"path", "shapes", "_bundled", "_cache_bytes", "_members"}
         return {name: value for name, value in vars(self).items() if name in kept}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -100,7 +101,7 @@ class NpzSource:
         self._forget()
 
     def _forget(self) -> None:
-        self._cache = TrajectoryCache(self._load_member)
+        self._cache = TrajectoryCache(self._load_member, self._cache_bytes)
         self._bundle: list[Trajectory] | None = None
 
     @contextmanager
@@ -110,7 +111,10 @@ class NpzSource:
         except FileNotFoundError:
             raise DataError(f"{self.path}: there is no such file") from None
         except _DAMAGE as error:
-            raise DataError(f"{self.path}: not a readable npz (zip) file: {error}") from error
+            raise DataError(
+                f"{self.path}: not a readable npz (zip) file of {self.path.stat().st_size} bytes: "
+                f"{error}; copy or download it again"
+            ) from error
         with archive:
             yield archive
 
@@ -140,8 +144,10 @@ class NpzSource:
             except restricted_pickle.RefusedPickleError as error:
                 raise DataError(f"{where}: refused, since it asks for {error}") from None
             except _DAMAGE as error:
+                offset = archive.getinfo(name).header_offset
                 raise DataError(
-                    f"{where}: damaged or truncated: {type(error).__name__}: {error}"
+                    f"{where} (at byte {offset}): damaged or truncated: {type(error).__name__}: "
+                    f"{error}; copy or download it again"
                 ) from error
 
     def _load(self, name: str) -> Any:

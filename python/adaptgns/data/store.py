@@ -1,7 +1,8 @@
 """The native store: HDF5 in LagrangeBench's layout.
 
 One group per trajectory (`00000`, `00001`, ...) with `position` float32 `[T, N, d]`,
-`particle_type` `[N]` and optionally `material_property` `[N]` or `[N, P]`. Files written here
+`particle_type` `[N]` and optionally `material_property` `[N]` or `[N, P]` and `step_context`
+`[T, C]`. Files written here
 keep positions contiguous and uncompressed, so that a window of frames is one read at a known
 offset; LagrangeBench's own are compressed in chunks, and read just as well.
 """
@@ -84,6 +85,8 @@ class StoreWriter:
         members.create_dataset("particle_type", data=types)
         if trajectory.material_property is not None:
             members.create_dataset("material_property", data=trajectory.material_property)
+        if trajectory.step_context is not None:
+            members.create_dataset("step_context", data=trajectory.step_context)
         self._written += 1
 
     def __enter__(self) -> StoreWriter:

@@ -53,15 +53,16 @@ class StoreSource:
     and kept, or frame by frame where one trajectory exceeds the cache.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, cache_bytes: int = CACHE_BYTES) -> None:
         self.path = path
+        self._cache_bytes = cache_bytes
         with self._file() as file:
             self._entries = [self._entry(file, name) for name in sorted(file)]
         self.shapes = tuple(
             Shape(entry.group, entry.shape[0], len(entry.particle_type), entry.shape[2])
             for entry in self._entries
         )
-        self._cache = TrajectoryCache(self._load)
+        self._cache = TrajectoryCache(self._load, self._cache_bytes)
 
     def read(self, index: int, start: int, stop: int) -> Trajectory:
         entry = self._entries[index]
@@ -88,7 +89,7 @@ class StoreSource:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._cache = TrajectoryCache(self._load)
+        self._cache = TrajectoryCache(self._load, self._cache_bytes)
 
     @contextmanager
     def _file(self) -> Iterator[h5py.File]:

@@ -17,11 +17,12 @@ from adaptgns.data.trajectory import Source, Trajectory, check_finite, check_sha
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["SPLITS", "Trajectories", "Trajectory", "find_split", "open_split"]
+__all__ = ["SPELLINGS", "SPLITS", "Trajectories", "Trajectory", "find_split", "open_split"]
 
 SPLITS = ("train", "valid", "test")
 
-_SPELLINGS = {"train": ("train",), "valid": ("valid", "val"), "test": ("test",)}
+SPELLINGS = {"train": ("train",), "valid": ("valid", "val"), "test": ("test",)}
+"""The names that a split's file may have."""
 
 
 class Trajectories:
@@ -111,7 +112,7 @@ def find_split(folder: Path, split: str) -> Path | None:
     candidates = [
         folder / f"{spelling}{suffix}"
         for suffix in (".h5", ".npz")
-        for spelling in _SPELLINGS[split]
+        for spelling in SPELLINGS[split]
     ]
     return next((path for path in candidates if path.is_file()), None)
 

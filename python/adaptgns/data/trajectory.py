@@ -32,12 +32,15 @@ class Trajectory:
         positions: float32 `[T, N, d]`, in the data's length unit.
         particle_type: int64 `[N]`, 0 to 8.
         material_property: float32 `[N, P]`, or None where the data has none.
+        step_context: float32 `[T, C]`, quantities of the whole frame in some DeepMind sets; the
+            store keeps them, but its readers leave them out, since no model here takes them.
     """
 
     name: str
     positions: npt.NDArray[np.float32]
     particle_type: npt.NDArray[np.int64]
     material_property: npt.NDArray[np.float32] | None = None
+    step_context: npt.NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
