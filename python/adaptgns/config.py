@@ -198,7 +198,7 @@ class TrainConfig:
     workers: int = 0
     """Processes that load data and build graphs; 0: the main one does."""
     threads: int | None = None
-    """CPU threads of torch; None: torch's own choice."""
+    """CPU threads; None: as many as torch would take, one per core."""
     validate_every: int = 5_000
     """Steps between validations."""
     validate_trajectories: int = 4

@@ -107,7 +107,11 @@ def convert(config: ConvertConfig, console: Console) -> list[str]:
         )
     suffix = _check_target(config, dest, (".h5", ".npz"))
     with _progress(console) as progress:
-        _write(dest, suffix, _told(_open(source, config.dim), source.name, progress))
+        _write(
+            dest,
+            suffix,
+            _told(_open(source, config.dim, flatten=config.dim == 2), source.name, progress),
+        )
     return []
 
 
@@ -155,10 +159,12 @@ def _find(folder: Path, split: str) -> Path | None:
     return None
 
 
-def _open(path: Path, dim: Literal[2, 3] | None) -> Trajectories | TfrecordFile | FrameFolders:
+def _open(
+    path: Path, dim: Literal[2, 3] | None, *, flatten: bool
+) -> Trajectories | TfrecordFile | FrameFolders:
     """The trajectories in `path`; no more than one of them stays in memory."""
     if path.is_dir():
-        return FrameFolders(path, dim=dim)
+        return FrameFolders(path, dim=dim, flatten=flatten)
     if path.suffix == ".tfrecord":
         return TfrecordFile(path)
     kind = NpzSource if path.suffix == ".npz" else StoreSource
@@ -192,8 +198,8 @@ def _convert_folder(config: ConvertConfig, console: Console) -> list[str]:
     with folder_written_whole(dest) as partial:
         with _progress(console) as progress:
             for split, path in found.items():
-                _write(partial / f"{split}{suffix}", suffix,
-                       _told(_open(path, dim), split, progress))  # fmt: skip
+                trajectories = _open(path, dim, flatten=config.dim == 2)
+                _write(partial / f"{split}{suffix}", suffix, _told(trajectories, split, progress))
         if content is None:
             return [
                 f"there is no {source / FILE_NAME}; write {dest / FILE_NAME} with dim, dt, bounds "
@@ -256,7 +262,9 @@ def _write_metadata(folder: Path, content: dict[str, Any], suffix: str) -> list[
                 "LagrangeBench takes all trajectories of a split to be as long as its first one"
             )
     if section.get("context_mean") is not None:
-        notes.append("step_context is kept in HDF5 files, but no model here takes it")
+        kept = "is kept, but no model here takes it"
+        dropped = "is dropped, since geoelements/gns has no place for it"
+        notes.append(f"step_context {dropped if suffix == '.npz' else kept}")
     if isinstance(content.get("rollout"), dict):
         section["rollout"] = content["rollout"]
     write_metadata(folder, section)

@@ -16,6 +16,23 @@ from torch.autograd.function import once_differentiable
 from adaptgns._core import network_backward, network_forward
 from adaptgns.segment import Graph
 
+_threads: int | None = None
+
+
+def divide_threads(count: int) -> None:
+    """From now on, ``count`` threads for the network here and one for torch.
+
+    Torch's threads go on spinning for a while after each of its operations, on the cores that the
+    network's would use; where the network is most of the work, that is slower than doing without.
+    """
+    global _threads  # noqa: PLW0603 (as torch's own number of threads)
+    _threads = count
+    torch.set_num_threads(1)
+
+
+def _thread_count() -> int:
+    return _threads or torch.get_num_threads()
+
 
 def applies(features: Tensor) -> bool:
     """Whether :func:`network` can do what torch would with ``features``."""
@@ -81,7 +98,7 @@ class _Network(torch.autograd.Function):
             _edges(graph, edge_features),
             heads=heads,
             keep=any(ctx.needs_input_grad),
-            threads=torch.get_num_threads(),
+            threads=_thread_count(),
         )
         ctx.graph, ctx.sizes, ctx.tape = graph, sizes, tape
         ctx.save_for_backward(node_features, edge_features, *parameters)
@@ -97,7 +114,7 @@ class _Network(torch.autograd.Function):
             _edges(ctx.graph, edge_features),
             ctx.tape,
             [_array(gradient) for gradient in gradients],
-            threads=torch.get_num_threads(),
+            threads=_thread_count(),
         )
         parts = torch.split(torch.from_numpy(of_parameters), [p.numel() for p in parameters])
         to_edges = None

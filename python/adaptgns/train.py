@@ -15,13 +15,21 @@ from rich.console import Console
 from adaptgns.atomic import replace_text
 from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint
 from adaptgns.command import plain_errors
-from adaptgns.config import PolicyName, RolloutConfig, TrainConfig, from_json, to_json
+from adaptgns.config import (
+    PolicyName,
+    RolloutConfig,
+    TrainConfig,
+    from_json,
+    to_json,
+    torch_device,
+)
 from adaptgns.data.check import check_split
 from adaptgns.data.default import EMBEDDED, dataset_folder
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.evaluate import evaluate
 from adaptgns.fit import Trainer, TrainingStopped
+from adaptgns.fused import divide_threads
 from adaptgns.plot import animate
 from adaptgns.presets import PRESETS
 from adaptgns.processes import Processes, processes
@@ -101,8 +109,11 @@ def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path
     data."""
     folder = group.same(run_folder(config))
     checkpoint = None if config.resume is None else read_checkpoint(config.resume / LAST)
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
+    threads = config.threads or torch.get_num_threads()
+    if torch_device(config.device).type == "cpu":
+        divide_threads(threads)
+    else:
+        torch.set_num_threads(threads)
     if group.first:  # who makes or completes what the others read
         read_metadata(dataset_folder(config.data))
     group.wait()

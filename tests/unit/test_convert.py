@@ -147,7 +147,7 @@ def test_step_context_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     one = trajectories()[0]
     (source / "train.tfrecord").write_bytes(record(example(one, context)))
     run(source, out)
-    assert "step_context is kept in HDF5 files, but no model" in capsys.readouterr().out
+    assert "step_context is kept, but no model" in capsys.readouterr().out
     with h5py.File(out / "train.h5") as file:
         assert file["00000/step_context"][()].tobytes() == context.tobytes()
     assert_same(out, "train", [one])
@@ -395,7 +395,7 @@ def test_wrong_frames_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "f_4.ply: other particle types than f_0.ply" in told(
         np.zeros((4, 3)), particle_type=one.particle_type + 1
     )
-    assert "f_4.ply: z isn't 0, as it is in f_0.ply; say --dim" in told(np.ones((4, 3)))
+    assert "f_4.ply: z isn't 0, but the data have two dimensions" in told(np.ones((4, 3)))
     assert "frame 4: particle 0 is at [nan, 0.0]" in told(
         np.array([[np.nan, 0, 0]] + [[0.0] * 3] * 3)
     )

@@ -49,15 +49,18 @@ class FrameFolders:
         path: the folder.
     """
 
-    def __init__(self, path: Path, *, dim: Literal[2, 3] | None = None) -> None:
-        """With `dim` None, a trajectory is two-dimensional if z is 0 in its first frame;
-        with 2, z is left out.
+    def __init__(
+        self, path: Path, *, dim: Literal[2, 3] | None = None, flatten: bool = False
+    ) -> None:
+        """With `dim` None, a trajectory is two-dimensional if z is 0 in its first frame.
+        Two-dimensional data whose z is not 0 are refused unless `flatten` leaves it out.
 
         Raises:
             DataError: there are no frames.
         """
         self.path = path
         self._dim = dim
+        self._flatten = flatten
         subfolders = sorted(entry for entry in path.iterdir() if holds_frames(entry))
         self._folders = [path] if holds_frames(path) else subfolders
         if not self._folders:
@@ -67,13 +70,12 @@ class FrameFolders:
         return len(self._folders)
 
     def __iter__(self) -> Iterator[Trajectory]:
-        return (_trajectory(folder, self._dim) for folder in self._folders)
+        return (_trajectory(folder, self._dim, self._flatten) for folder in self._folders)
 
 
-def _trajectory(folder: Path, dim: int | None) -> Trajectory:
+def _trajectory(folder: Path, dim: int | None, flatten: bool) -> Trajectory:
     paths = _ordered(folder)
     first = _read(paths[0])
-    guessed = dim is None
     dim = dim or (3 if first.points[:, 2].any() else 2)
     particles = len(first.points)
     check_shape(Shape(folder.name, len(paths), particles, dim), str(folder))
@@ -81,10 +83,10 @@ def _trajectory(folder: Path, dim: int | None) -> Trajectory:
     for frame, path in enumerate(paths):
         snapshot = first if frame == 0 else _read(path)
         _check_alike(snapshot, first, path, paths[0])
-        if guessed and dim == 2 and snapshot.points[:, 2].any():
+        if dim == 2 and not flatten and snapshot.points[:, 2].any():
             raise DataError(
-                f"{path}: z isn't 0, as it is in {paths[0].name}; say --dim 3, or --dim 2 to "
-                "leave z out"
+                f"{path}: z isn't 0, but the data have two dimensions by {paths[0].name} or by "
+                "their metadata.json; say --dim 3, or --dim 2 to leave z out"
             )
         positions[frame] = snapshot.points[:, :dim]
     where = str(folder)

@@ -6,8 +6,9 @@
 //! is found through one atomic pointer, carries the id of the process that made it,
 //! and a process with another id makes its own and leaks the old one.
 
+use std::cell::{Cell, UnsafeCell};
 use std::num::NonZeroUsize;
-use std::sync::atomic::{AtomicPtr, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -86,22 +87,42 @@ pub fn map<I: Send, R: Send>(
     items: Vec<I>,
     task: impl Fn(I) -> R + Sync,
 ) -> Vec<R> {
+    let Some((pool, spawned)) = helpers_for(threads, items.len()) else {
+        return items.into_iter().map(task).collect();
+    };
+    share(items, task, |work| {
+        pool.in_place_scope(|scope| {
+            for _ in 0..spawned {
+                scope.spawn(|_| work());
+            }
+            work();
+        });
+    })
+}
+
+/// The pool and how many of it may help with `count` items; `None` if the caller works alone.
+fn helpers_for(threads: Threads, count: usize) -> Option<(&'static ThreadPool, usize)> {
     let wanted = match threads {
         Threads::All => usize::MAX,
         Threads::AtMost(limit) => limit.get(),
     };
-    let count = items.len();
-    let pool = (wanted > 1 && count > 1).then(helpers).and_then(|helpers| {
-        let spawned = helpers.count.min(wanted - 1).min(count - 1);
-        helpers.pool.as_ref().map(|pool| (pool, spawned))
-    });
-    let Some((pool, spawned)) = pool else {
-        return items.into_iter().map(task).collect();
-    };
+    if wanted < 2 || count < 2 {
+        return None;
+    }
+    let helpers = helpers();
+    let spawned = helpers.count.min(wanted - 1).min(count - 1);
+    helpers.pool.as_ref().map(|pool| (pool, spawned))
+}
 
+/// `task` of every item, in order; `run` calls what it is given on as many threads as it likes.
+fn share<I: Send, R: Send>(
+    items: Vec<I>,
+    task: impl Fn(I) -> R + Sync,
+    run: impl FnOnce(&(dyn Fn() + Sync)),
+) -> Vec<R> {
+    let finished = Mutex::new(Vec::with_capacity(items.len()));
     let waiting = Mutex::new(items.into_iter().enumerate());
-    let finished = Mutex::new(Vec::with_capacity(count));
-    let work = || {
+    run(&|| {
         let mut mine = Vec::new();
         loop {
             let next = lock(&waiting).next();
@@ -109,20 +130,165 @@ pub fn map<I: Send, R: Send>(
             mine.push((i, task(item)));
         }
         lock(&finished).append(&mut mine);
-    };
-    pool.in_place_scope(|scope| {
-        for _ in 0..spawned {
-            scope.spawn(|_| work());
-        }
-        work();
     });
     let mut results = std::mem::take(&mut *lock(&finished));
     results.sort_unstable_by_key(|&(i, _)| i);
     results.into_iter().map(|(_, result)| result).collect()
 }
 
+/// Threads that stay awake from one [`Team::map`] to the next: waking them costs more than a short
+/// one takes.
+pub struct Team {
+    /// What there is to do while `open` is not 0.
+    work: UnsafeCell<Option<*const (dyn Fn() + Sync)>>,
+    /// Number of the work that helpers may begin; 0 for none.
+    open: AtomicUsize,
+    /// Helpers that may be at work.
+    active: AtomicUsize,
+    /// How many have come before.
+    count: Cell<usize>,
+    over: AtomicBool,
+    helped: bool,
+}
+
+/// What helpers see of a [`Team`].
+struct Helped<'t>(&'t Team);
+
+// SAFETY: a helper touches `open`, `active`, `over` and, while `open` says so and `active` counts
+// it, `work`, which its owner does not change then; `count` is the owner's.
+unsafe impl Sync for Helped<'_> {}
+
+/// What `body` returns, which may share its work with up to `threads` threads.
+pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
+    let helpers = helpers_for(threads, usize::MAX);
+    let team = Team {
+        work: UnsafeCell::new(None),
+        open: AtomicUsize::new(0),
+        active: AtomicUsize::new(0),
+        count: Cell::new(0),
+        over: AtomicBool::new(false),
+        helped: helpers.is_some(),
+    };
+    let Some((pool, spawned)) = helpers else {
+        return body(&team);
+    };
+    let helped = Helped(&team);
+    pool.in_place_scope(|scope| {
+        // Also where `body` panics: the scope waits for the helpers.
+        let _over = OnDrop(|| team.over.store(true, Ordering::Release));
+        for _ in 0..spawned {
+            scope.spawn(|_| helped.help());
+        }
+        body(&team)
+    })
+}
+
+impl Helped<'_> {
+    fn help(&self) {
+        let team = self.0;
+        let mut last = 0;
+        let mut idle = 0_u32;
+        while !team.over.load(Ordering::Acquire) {
+            let number = team.open.load(Ordering::SeqCst);
+            if number == 0 || number == last {
+                idle += 1;
+                if idle.is_multiple_of(1 << 10) {
+                    std::thread::yield_now(); // others may need the core
+                }
+                std::hint::spin_loop();
+                continue;
+            }
+            idle = 0;
+            last = number;
+            team.active.fetch_add(1, Ordering::SeqCst);
+            let _left = OnDrop(|| {
+                team.active.fetch_sub(1, Ordering::Release);
+            });
+            // Open still, so the owner waits until this helper has left.
+            if team.open.load(Ordering::SeqCst) == number {
+                // SAFETY: the owner changes the work, and lets what it points to go, only after it
+                // has closed it and no helper is active.
+                if let Some(work) = unsafe { *team.work.get() } {
+                    // SAFETY: as above.
+                    unsafe { (*work)() };
+                }
+            }
+        }
+    }
+}
+
+impl Team {
+    /// `task` of every item, in the order of the items, computed by the whole team.
+    pub fn map<I: Send, R: Send>(&self, items: Vec<I>, task: impl Fn(I) -> R + Sync) -> Vec<R> {
+        if !self.helped || items.len() < 2 {
+            return items.into_iter().map(task).collect();
+        }
+        share(items, task, |work| {
+            // SAFETY: only the lifetime changes, and nobody uses it after `closed` below, which is
+            // dropped before `work` ends.
+            let work: *const (dyn Fn() + Sync) = unsafe {
+                std::mem::transmute::<&(dyn Fn() + Sync), &'static (dyn Fn() + Sync)>(work)
+            };
+            // SAFETY: nothing is open and nobody active, so no helper looks.
+            unsafe { *self.work.get() = Some(work) };
+            self.count.set(self.count.get() + 1);
+            self.open.store(self.count.get(), Ordering::SeqCst);
+            let _closed = OnDrop(|| {
+                self.open.store(0, Ordering::SeqCst);
+                while self.active.load(Ordering::SeqCst) > 0 {
+                    std::hint::spin_loop();
+                }
+            });
+            // SAFETY: it is alive, see above.
+            unsafe { (*work)() };
+        })
+    }
+}
+
+/// Calls what it holds when it goes out of scope, also in a panic.
+struct OnDrop<F: FnMut()>(F);
+
+impl<F: FnMut()> Drop for OnDrop<F> {
+    fn drop(&mut self) {
+        (self.0)();
+    }
+}
+
 /// Locks; what a panicking thread held is as good as ever, and its panic surfaces when
 /// the scope ends.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_team_does_one_thing_after_the_other() {
+        for threads in [Threads::All, Threads::AtMost(NonZeroUsize::MIN)] {
+            let total = team(threads, |team| {
+                let mut numbers: Vec<u64> = (0..40).collect();
+                for _ in 0..2_000 {
+                    numbers = team.map(numbers, |x| x + 1);
+                }
+                numbers
+            });
+            assert_eq!(total, (2_000..2_040).collect::<Vec<u64>>());
+        }
+    }
+
+    #[test]
+    fn a_panic_in_a_team_surfaces() {
+        let result = std::panic::catch_unwind(|| {
+            team(Threads::All, |team| {
+                team.map((0..100).collect(), |x: i32| assert!(x != 57, "57"));
+            });
+        });
+        assert!(result.is_err());
+        assert_eq!(
+            team(Threads::All, |team| team.map(vec![1, 2, 3], |x| 2 * x)),
+            [2, 4, 6]
+        );
+    }
 }

@@ -1,12 +1,21 @@
 //! Memory that goes from one step to the next, since fresh memory costs a page fault every 4 KiB.
 
 use std::ops::{Deref, DerefMut};
-use std::sync::Mutex;
+use std::sync::{Mutex, MutexGuard};
 
 /// The most numbers that wait for use (1 GiB); what goes beyond is freed.
 const MOST: usize = 1 << 28;
 
 static FREE: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
+
+/// The list of what waits; `None` if it stays locked, as it would in a process that forked while
+/// another thread held it.
+fn free() -> Option<MutexGuard<'static, Vec<Vec<f32>>>> {
+    (0..1_000).find_map(|_| {
+        std::hint::spin_loop();
+        FREE.try_lock().ok()
+    })
+}
 
 /// Numbers whose memory is used again once they are dropped.
 #[derive(Default)]
@@ -15,8 +24,7 @@ pub(super) struct Buffer(Vec<f32>);
 impl Buffer {
     /// `length` numbers of any value.
     pub fn any(length: usize) -> Self {
-        // Where the lock is held, or was when the process forked, memory comes fresh.
-        let waiting = FREE.try_lock().ok().and_then(|mut free| {
+        let waiting = free().and_then(|mut free| {
             let fits = |data: &Vec<f32>| (length..=length + length / 2).contains(&data.capacity());
             if let Some(place) = free.iter().rposition(fits) {
                 return Some(free.remove(place));
@@ -52,7 +60,7 @@ impl Drop for Buffer {
         if self.0.capacity() == 0 {
             return;
         }
-        if let Ok(mut free) = FREE.try_lock() {
+        if let Some(mut free) = free() {
             free.push(std::mem::take(&mut self.0));
             let mut waiting: usize = free.iter().map(Vec::capacity).sum();
             while waiting > MOST {

@@ -21,7 +21,7 @@ use std::ops::Range;
 
 pub use mlp::{Linear, Mlp, Norm};
 
-use crate::threads::{self, Threads};
+use crate::threads::{self, Team, Threads};
 use buffer::Buffer;
 use matrix::{Matrix, Start, product};
 use mlp::{Input, Kept, KeptMut, split};
@@ -128,6 +128,17 @@ impl Network<'_> {
         threads: Threads,
     ) -> Result<(Vec<Vec<f32>>, Option<Tape>), crate::Error> {
         self.check(&features)?;
+        Ok(threads::team(threads, |team| {
+            self.pass_forward(features, keep, team)
+        }))
+    }
+
+    fn pass_forward(
+        &self,
+        features: Features<'_>,
+        keep: bool,
+        team: &Team,
+    ) -> (Vec<Vec<f32>>, Option<Tape>) {
         let width = self.width();
         let count = self.node_count(&features);
         let rows = |mlp: &Mlp<'_>, rows| keep.then(|| mlp.kept(rows));
@@ -139,7 +150,7 @@ impl Network<'_> {
         let pass = Pass {
             lengths: &lengths,
             rows: count,
-            threads,
+            team,
         };
         pass.forward(
             &self.node_encoder,
@@ -160,7 +171,7 @@ impl Network<'_> {
             let pass = Pass {
                 lengths: &lengths,
                 rows: edge_count,
-                threads,
+                team,
             };
             pass.forward(
                 encoder,
@@ -188,7 +199,7 @@ impl Network<'_> {
                     &mut edge,
                     &mut edges,
                     &mut incoming,
-                    threads,
+                    team,
                 );
             }
             pass.update_nodes(&layer.node, &incoming, &mut nodes, &mut node);
@@ -221,7 +232,7 @@ impl Network<'_> {
             nodes,
             edges,
         });
-        Ok((outputs, tape))
+        (outputs, tape)
     }
 
     /// The gradients that follow from those of the heads' outputs, after a forward pass over the
@@ -235,13 +246,25 @@ impl Network<'_> {
     ) -> Result<Gradients, crate::Error> {
         self.check(&features)?;
         self.check_tape(&features, tape, heads)?;
+        Ok(threads::team(threads, |team| {
+            self.pass_backward(features, tape, heads, team)
+        }))
+    }
+
+    fn pass_backward(
+        &self,
+        features: Features<'_>,
+        tape: &mut Tape,
+        heads: &[&[f32]],
+        team: &Team,
+    ) -> Gradients {
         let width = self.width();
         let count = self.node_count(&features);
         let lengths = lengths(count);
         let pass = Pass {
             lengths: &lengths,
             rows: count,
-            threads,
+            team,
         };
         // From the back: the order of the parameters, turned round.
         let mut parameters: Vec<Buffer> = Vec::new();
@@ -300,7 +323,7 @@ impl Network<'_> {
                     &to_incoming,
                     &mut to_receivers,
                     &mut to_first,
-                    threads,
+                    team,
                 );
                 let of_nodes = pass.project_backward(
                     mlp,
@@ -326,7 +349,7 @@ impl Network<'_> {
                 Pass {
                     lengths: &lengths,
                     rows: edge_count,
-                    threads,
+                    team,
                 }
                 .backward(
                     encoder,
@@ -346,14 +369,14 @@ impl Network<'_> {
             &mut [(&mut by_nodes[..], 0)],
         ));
         parameters.reverse();
-        Ok(Gradients {
+        Gradients {
             parameters: parameters
                 .iter()
                 .flat_map(|part| part.iter().copied())
                 .collect(),
             nodes: by_nodes,
             edges: by_edges,
-        })
+        }
     }
 }
 
@@ -457,7 +480,7 @@ impl Place<'_> {
 struct Pass<'p> {
     lengths: &'p [usize],
     rows: usize,
-    threads: Threads,
+    team: &'p Team,
 }
 
 impl Pass<'_> {
@@ -474,7 +497,7 @@ impl Pass<'_> {
             .zip(Place::of(kept, mlp, self.lengths, self.rows))
             .zip(split(out, self.lengths, self.rows))
             .collect();
-        threads::map(self.threads, items, |((start, mut place), out)| {
+        self.team.map(items, |((start, mut place), out)| {
             for ((first, count), out) in
                 blocks(out.len() / width).zip(out.chunks_mut(BLOCK * width))
             {
@@ -505,7 +528,7 @@ impl Pass<'_> {
             .zip(Place::of(kept, mlp, self.lengths, self.rows))
             .zip(split(nodes, self.lengths, self.rows))
             .collect();
-        threads::map(self.threads, items, |((start, mut place), nodes)| {
+        self.team.map(items, |((start, mut place), nodes)| {
             let mut update = Buffer::any(BLOCK * width);
             for ((first, count), nodes) in
                 blocks(nodes.len() / width).zip(nodes.chunks_mut(BLOCK * width))
@@ -547,7 +570,7 @@ impl Pass<'_> {
         let items: Vec<_> = starts(self.lengths)
             .zip(split(&mut out, self.lengths, self.rows))
             .collect();
-        threads::map(self.threads, items, |(start, out)| {
+        self.team.map(items, |(start, out)| {
             let count = out.len() / (2 * width);
             let nodes = Matrix::new(&nodes[start * width..(start + count) * width], width);
             for end in 0..2 {
@@ -586,10 +609,9 @@ impl Pass<'_> {
             .zip(kept.parts(self.lengths, self.rows))
             .zip(of_parts)
             .collect();
-        let sums = threads::map(
-            self.threads,
-            items,
-            |(((start, &length), mut kept), mut targets)| {
+        let sums = self
+            .team
+            .map(items, |(((start, &length), mut kept), mut targets)| {
                 let mut sum = Buffer::zeros(mlp.parameters());
                 let (mut here, mut there) =
                     (Buffer::any(BLOCK * widest), Buffer::any(BLOCK * widest));
@@ -609,8 +631,7 @@ impl Pass<'_> {
                     }
                 }
                 sum
-            },
-        );
+            });
         total(sums)
     }
 
@@ -631,7 +652,7 @@ impl Pass<'_> {
         let items: Vec<_> = starts(self.lengths)
             .zip(split(to_nodes, self.lengths, self.rows))
             .collect();
-        let sums = threads::map(self.threads, items, |(start, to_nodes)| {
+        let sums = self.team.map(items, |(start, to_nodes)| {
             let mut sum = Buffer::zeros(mlp.parameters());
             let count = to_nodes.len() / width;
             let mut to_senders = Buffer::zeros(to_nodes.len());
@@ -668,7 +689,7 @@ fn update_edges(
     kept: &mut Option<Kept>,
     edges: &mut [f32],
     incoming: &mut [f32],
-    threads: Threads,
+    team: &Team,
 ) {
     let width = mlp.outputs();
     let (lengths, nodes) = part_lengths(parts);
@@ -679,7 +700,7 @@ fn update_edges(
         .zip(split(edges, &lengths, count))
         .zip(split(incoming, &nodes, graph.offsets.len() - 1))
         .collect();
-    threads::map(threads, items, |(((part, mut place), edges), incoming)| {
+    team.map(items, |(((part, mut place), edges), incoming)| {
         let mut messages = Buffer::any(BLOCK * width);
         for ((first, count), edges) in blocks(part.edges.len()).zip(edges.chunks_mut(BLOCK * width))
         {
@@ -720,7 +741,7 @@ fn edges_backward(
     to_incoming: &[f32],
     to_receivers: &mut [f32],
     to_first: &mut [f32],
-    threads: Threads,
+    team: &Team,
 ) -> Buffer {
     let width = mlp.outputs();
     let (lengths, nodes) = part_lengths(parts);
@@ -733,7 +754,7 @@ fn edges_backward(
         .zip(split(to_first, &lengths, count))
         .zip(split(to_receivers, &nodes, graph.offsets.len() - 1))
         .collect();
-    let sums = threads::map(threads, items, |item| {
+    let sums = team.map(items, |item| {
         let (((((part, mut kept), edges), to_edges), to_first), to_receivers) = item;
         let mut sum = Buffer::zeros(mlp.parameters());
         let (mut here, mut there) = (Buffer::any(BLOCK * width), Buffer::any(BLOCK * width));
