@@ -74,7 +74,7 @@ function graphOf(rollout, frame) {
   const far = anyHigh ? radius * rollout.adaptive.factor : radius;
   const cells = new Cells(rollout, codes, far);
   const around = new Map();
-  const scale = extent.map((length) => length / LARGEST);
+  const at = Float64Array.from(codes, (code, k) => code * extent[k % dim] / LARGEST);
   const base = [], extra = [];
   let baseCount = 0, extraCount = 0;
   for (let i = 0; i < particles; i++) {
@@ -87,7 +87,7 @@ function graphOf(rollout, frame) {
         if (j <= i) continue;
         let square = 0, wraps = false;
         for (let axis = 0; axis < dim; axis++) {
-          let d = (codes[i * dim + axis] - codes[j * dim + axis]) * scale[axis];
+          let d = at[i * dim + axis] - at[j * dim + axis];
           if (period[axis] && Math.abs(d) > period[axis] / 2) {
             d = period[axis] - Math.abs(d);
             wraps = true;

@@ -195,9 +195,9 @@ class Viewer {
     for (const curve of this.curves) curve.draw(step);
   }
 
-  // [N] shares of the colour scale; -1 for the plain colour, -2 for kinematic particles.
+  // [N] shares of the colour scale, or PLAIN or KINEMATIC.
   values(colour, side) {
-    const { rollout, frame } = this, result = new Float32Array(rollout.particles).fill(-1);
+    const { rollout, frame } = this, result = new Float32Array(rollout.particles).fill(PLAIN);
     if (colour === "type") return result.map((_, i) => (rollout.types[i] % 9 + 9) % 9 / 255);
     const measured = {
       plain: () => null,
@@ -207,7 +207,7 @@ class Viewer {
     }[colour]();
     const share = measured && this.share(colour);
     for (let i = 0; i < result.length; i++) {
-      if (!rollout.mobile[i]) result[i] = -2;
+      if (!rollout.mobile[i]) result[i] = KINEMATIC;
       else if (measured && measured[i] >= 0) result[i] = Math.min(1, Math.max(0, share(measured[i])));
     }
     return result;
@@ -224,7 +224,7 @@ class Viewer {
     this.scaled = colour;
     const { palette, scales, types } = this.rollout;
     const bytes = new Uint8Array(768);
-    if (colour === "type") palette.types.forEach((hex, type) => bytes.set(rgb(hex).map((x) => 255 * x), 3 * type));
+    if (colour === "type") palette.types.forEach((hex, type) => bytes.set(rgb(hex), 3 * type));
     else bytes.set(palette.maps[colour]);
     this.scene.setRamp(bytes);
     element("scale").hidden = colour === "type";
