@@ -12,10 +12,10 @@ from PIL import Image
 
 from adaptgns.animation import Animation
 from adaptgns.data.metadata import Metadata
-from adaptgns.plot import animate, main
-from adaptgns.rollout_file import RolloutFile
+from adaptgns.plot import animate, main, viewer
+from adaptgns.rollout_file import RolloutFile, RolloutWriter
 from adaptgns.view import View
-from tests.unit.rollouts import write_rollout
+from tests.unit.rollouts import falling_block, settings, steps_of, write_rollout
 
 
 @pytest.fixture
@@ -110,6 +110,51 @@ def test_command(tmp_path: Path, adaptive: Path, capsys: pytest.CaptureFixture[s
             main(["animate", "--rollout", str(adaptive), "--out", str(out), *wrong])
         assert stopped.value.code == 2
     assert "error: every, fps: got 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--out", "a.gif"], "out: got a.gif; a file called .html is accepted"),
+        (["--out", "a.html", "--trajectory", "2"], "trajectory: got 2; "),
+        (["--out", "a.html", "--trajectory", "-1"], "trajectory: got -1; "),
+    ],
+)
+def test_viewer_refuses(
+    tmp_path: Path,
+    adaptive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    told: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        main(["viewer", str(adaptive), *arguments])
+    assert stopped.value.code == 2
+    assert f"error: {told}" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_viewer_refuses_an_empty_scene(tmp_path: Path, metadata: Metadata) -> None:
+    path = tmp_path / "a.h5"
+    nobody = falling_block(particles=3)
+    nobody = replace(
+        nobody, positions=nobody.positions[:, :0], particle_type=nobody.particle_type[:0]
+    )
+    with RolloutWriter(path, metadata=metadata, settings=settings()) as writer:
+        writer.add(nobody, steps_of(nobody))
+    with pytest.raises(ValueError, match="trajectory block 0 of .* has no particles"):
+        viewer(path, tmp_path / "a.html")
+
+
+def test_viewer_page_is_whole_by_itself(tmp_path: Path, adaptive: Path) -> None:
+    viewer(adaptive, tmp_path / "a.html")
+    page = (tmp_path / "a.html").read_text("utf-8")
+    assert not [word for word in ("http", "src=", "href=", "import(", "fetch(") if word in page]
+    assert "{{" not in page
+    viewer(adaptive, tmp_path / "b.html")
+    assert (tmp_path / "b.html").read_text("utf-8") == page
 
 
 def in_three_dimensions(metadata: Metadata) -> Metadata:

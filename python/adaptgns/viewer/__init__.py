@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from adaptgns import palette
 from adaptgns.atomic import replace_text
+from adaptgns.data.metadata import GNS_KINEMATIC
 from adaptgns.metrics import Floats, position_mse
 from adaptgns.periodic import minimum_image
 from adaptgns.rollout_file import Rollout, RolloutFile
@@ -32,8 +33,8 @@ MARGIN = 0.02
 CLIPPED = (1.0, 99.5)
 """Percentiles that the colour scales end at"""
 SCRIPTS = ("data.js", "graph.js", "scene.js", "curves.js", "viewer.js")
-EVOLVING = ("adaptive",)
-"""Policies whose extra edges follow from what the page holds"""
+TYPE_NAMES = {3: "boundary", 5: "water", 6: "sand", 7: "goop"}
+"""Of the data of geoelements/gns"""
 
 
 def write_viewer(file: RolloutFile, rollout: Rollout, path: Path) -> None:
@@ -55,7 +56,9 @@ def _page(file: RolloutFile, rollout: Rollout, every: int) -> str:
     """The page with every ``every``-th frame and the last one."""
     scene, tensors = _content(file, rollout, every)
     folder = files("adaptgns.viewer")
-    text = {name: folder.joinpath(name).read_text("utf-8") for name in ("viewer.html", "viewer.css")}
+    text = {
+        name: folder.joinpath(name).read_text("utf-8") for name in ("viewer.html", "viewer.css")
+    }
     script = "\n".join(folder.joinpath(name).read_text("utf-8") for name in SCRIPTS)
     data = [_block("scene", json.dumps(scene, allow_nan=False).encode())]
     data += [_block(name, content) for name, content in tensors.items()]
@@ -89,10 +92,9 @@ def _content(
     bounds = np.array(metadata.bounds, dtype=np.float64)
     margin = np.where(metadata.periodic, 0.0, MARGIN * np.ptp(bounds, axis=1))
     lower, upper = bounds[:, 0] - margin, bounds[:, 1] + margin
-    coordinates = Range(lower, upper)
     mse = position_mse(rollout.predicted, rollout.true, mobile, metadata.box)
     tensors = {
-        name: encoded(_positions(x[shown], coordinates, metadata.periodic), order=2)
+        name: encoded(_positions(x[shown], lower, upper, metadata.periodic), order=2)
         for name, x in (("true", true), ("predicted", predicted))
     }
     scales: dict[str, Any] = {
@@ -108,7 +110,7 @@ def _content(
         logarithm = Range(finite.min(), max(finite.max(), finite.min() + 1e-6))
         tensors["sigma"] = encoded(quantized(finite, logarithm), order=1)
         scales["sigma"] = _decades(sigma[:, mobile])
-    adaptive = file.policy in EVOLVING and sigma is not None
+    adaptive = file.policy == "adaptive" and sigma is not None
     scene = {
         "label": file.label,
         "policy": file.policy,
@@ -126,7 +128,10 @@ def _content(
         "adaptive": {"tau": file.tau, "factor": file.factor} if adaptive else None,
         "mobile": mobile.astype(int).tolist(),
         "types": rollout.particle_type.tolist(),
-        "log_sigma": None if logarithm is None else [float(logarithm.lower), float(logarithm.upper)],
+        "type_names": TYPE_NAMES if metadata.kinematic_types == GNS_KINEMATIC else {},
+        "log_sigma": None
+        if logarithm is None
+        else [float(logarithm.lower), float(logarithm.upper)],
         "scales": scales,
         "edges": rollout.edges.tolist(),
         "mse": [value if np.isfinite(value) else None for value in mse.tolist()],
@@ -136,17 +141,18 @@ def _content(
 
 
 def _positions(
-    positions: Floats, coordinates: Range, periodic: tuple[bool, ...]
+    positions: Floats,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    periodic: tuple[bool, ...],
 ) -> NDArray[np.uint16]:
     """``[F, N, d]`` codes; those of a particle out of the range, or nowhere, are OUTSIDE."""
     inside = positions.astype(np.float64)
-    period = coordinates.upper - coordinates.lower
     for axis in np.flatnonzero(periodic):
-        inside[..., axis] = coordinates.lower[axis] + np.mod(
-            inside[..., axis] - coordinates.lower[axis], period[axis]
-        )
-    seen = ((inside >= coordinates.lower) & (inside <= coordinates.upper)).all(axis=2)
-    codes = quantized(np.where(seen[..., None], inside, coordinates.lower), coordinates)
+        period = upper[axis] - lower[axis]
+        inside[..., axis] = lower[axis] + np.mod(inside[..., axis] - lower[axis], period)
+    seen = np.all((inside >= lower) & (inside <= upper), axis=2)
+    codes = quantized(np.where(seen[..., None], inside, lower), Range(lower, upper))
     codes[~seen] = OUTSIDE
     return codes
 

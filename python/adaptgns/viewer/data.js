@@ -1,7 +1,7 @@
 "use strict";
 // What Python left in the page: a scene in JSON, and tensors as gzipped differences of 16 bits.
 
-async function inflated(id) {
+async function bytesOf(id) {
   const element = document.getElementById(`data-${id}`);
   const text = atob(element.textContent);
   element.textContent = "";
@@ -12,7 +12,7 @@ async function inflated(id) {
 
 // The inverse of encoded() in encoding.py: rows of `width` codes, summed `order` times.
 async function readTensor(id, width, order) {
-  const packed = new Blob([await inflated(id)]).stream();
+  const packed = new Blob([await bytesOf(id)]).stream();
   const stream = packed.pipeThrough(new DecompressionStream("gzip"));
   const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
   const count = bytes.length / 2;
@@ -28,8 +28,11 @@ const OUTSIDE = 0xffff, LARGEST = 0xfffe;
 
 class Rollout {
   static async read() {
+    if (!window.DecompressionStream) {
+      throw new Error("This page needs a browser of 2023 or later, which can unpack its data (DecompressionStream).");
+    }
     const rollout = new Rollout();
-    const scene = JSON.parse(new TextDecoder().decode(await inflated("scene")));
+    const scene = JSON.parse(new TextDecoder().decode(await bytesOf("scene")));
     Object.assign(rollout, scene);
     const width = scene.particles * scene.dim;
     rollout.positions = {

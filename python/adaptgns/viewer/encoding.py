@@ -17,8 +17,8 @@ LARGEST = OUTSIDE - 1
 class Range:
     """What the codes 0 and LARGEST stand for, scalars or one value an axis."""
 
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    lower: np.float64 | NDArray[np.float64]
+    upper: np.float64 | NDArray[np.float64]
 
 
 def quantized(values: NDArray[np.float64], limits: Range) -> NDArray[np.uint16]:

@@ -2,7 +2,6 @@
 
 const element = (id) => document.getElementById(id);
 const RATES = [8, 15, 30, 60, 120];  // steps per second
-const TYPE_NAMES = { 3: "boundary", 5: "water", 6: "sand", 7: "goop" };
 
 class Viewer {
   constructor(rollout) {
@@ -30,7 +29,7 @@ class Viewer {
       `dt ${formatted(dt)}`, `r ${radius}`,
     ];
     if (adaptive) facts.push(`τ ${adaptive.tau}`, `factor ${adaptive.factor}`);
-    if (every > 1) facts.push(`every ${every}th step is shown, to keep the file small`);
+    if (every > 1) facts.push(`1 step in ${every} is shown, to keep the file small`);
     if (!["fixed", "adaptive"].includes(policy)) {
       facts.push(`the edges drawn are those within r: what the policy ${policy} chose is not recorded`);
     }
@@ -183,7 +182,7 @@ class Viewer {
     };
     const prediction = {
       codes: rollout.codes("predicted", frame), edges, plain: palette.predicted, opacity: 1,
-      glow: colour === "sigma" ? 0.5 : 0, values: this.values(colour, "predicted"),
+      glow: colour !== "sigma" ? 0 : rollout.dim === 3 ? 0.1 : 0.5, values: this.values(colour, "predicted"),
     };
     this.scene.draw(over
       ? [{ x: 0, width: 1, clouds: [truth, prediction] }]
@@ -222,7 +221,7 @@ class Viewer {
   setScale(colour) {
     if (colour === this.scaled) return;
     this.scaled = colour;
-    const { palette, scales, types } = this.rollout;
+    const { palette, scales, types, type_names } = this.rollout;
     const bytes = new Uint8Array(768);
     if (colour === "type") palette.types.forEach((hex, type) => bytes.set(rgb(hex), 3 * type));
     else bytes.set(palette.maps[colour]);
@@ -234,7 +233,7 @@ class Viewer {
         const key = document.createElement("span"), dot = document.createElement("i");
         dot.className = "dot";
         dot.style.background = palette.types[(type % 9 + 9) % 9];
-        key.append(dot, `type ${type}${TYPE_NAMES[type] ? `, ${TYPE_NAMES[type]}` : ""}`);
+        key.append(dot, ["type " + type, type_names[type]].filter(Boolean).join(", "));
         return key;
       }));
       return;
