@@ -13,9 +13,9 @@ from PIL import Image
 from adaptgns.animation import Animation
 from adaptgns.data.metadata import Metadata
 from adaptgns.plot import animate, main, viewer
-from adaptgns.rollout_file import RolloutFile, RolloutWriter
+from adaptgns.rollout_file import RolloutFile
 from adaptgns.view import View
-from tests.unit.rollouts import falling_block, settings, steps_of, write_rollout
+from tests.unit.rollouts import write_rollout
 
 
 @pytest.fixture
@@ -136,16 +136,20 @@ def test_viewer_refuses(
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
-def test_viewer_refuses_an_empty_scene(tmp_path: Path, metadata: Metadata) -> None:
-    path = tmp_path / "a.h5"
-    nobody = falling_block(particles=3)
-    nobody = replace(
-        nobody, positions=nobody.positions[:, :0], particle_type=nobody.particle_type[:0]
-    )
-    with RolloutWriter(path, metadata=metadata, settings=settings()) as writer:
-        writer.add(nobody, steps_of(nobody))
-    with pytest.raises(ValueError, match="trajectory block 0 of .* has no particles"):
-        viewer(path, tmp_path / "a.html")
+def test_viewer_refuses_a_scene_that_predicts_nothing(tmp_path: Path, adaptive: Path) -> None:
+    with h5py.File(adaptive, "r+") as file:
+        file["00000/particle_type"][:] = 3
+    with pytest.raises(ValueError, match=r"trajectory block 0 .*has kinematic particles only"):
+        viewer(adaptive, tmp_path / "a.html")
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+def test_viewer_shows_what_diverged(tmp_path: Path, metadata: Metadata, periodic: bool) -> None:
+    path = write_rollout(tmp_path / "a.h5", replace(metadata, periodic=(periodic, False)))
+    with h5py.File(path, "r+") as file:
+        file["00000/predicted"][4:] = np.inf
+        file["00000/sigma"][:] = np.nan
+    viewer(path, tmp_path / "a.html")
 
 
 def test_viewer_page_is_whole_by_itself(tmp_path: Path, adaptive: Path) -> None:

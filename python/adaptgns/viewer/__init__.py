@@ -40,12 +40,15 @@ TYPE_NAMES = {3: "boundary", 5: "water", 6: "sand", 7: "goop"}
 def write_viewer(file: RolloutFile, rollout: Rollout, path: Path) -> None:
     """Write the page of ``rollout`` of ``file`` to ``path``, whole or not at all.
 
-    ValueError for a path that is not called .html, or a trajectory without particles.
+    ValueError for a path that is not called .html, or a trajectory that predicts nothing.
     """
     if path.suffix.lower() != ".html":
         raise ValueError(f"out: got {path}; a file called .html is accepted")
-    if rollout.particle_type.size == 0:
-        raise ValueError(f"rollout: trajectory {rollout.name} of {file.path} has no particles")
+    if not file.metadata.mobile(rollout.particle_type).any():
+        raise ValueError(
+            f"rollout: trajectory {rollout.name} of {file.path} has kinematic particles only; "
+            "nothing in it is predicted"
+        )
     every = 1
     while len(page := _page(file, rollout, every)) > LIMIT and every < rollout.steps:
         every = math.ceil(every * len(page) / LIMIT)
@@ -54,7 +57,8 @@ def write_viewer(file: RolloutFile, rollout: Rollout, path: Path) -> None:
 
 def _page(file: RolloutFile, rollout: Rollout, every: int) -> str:
     """The page with every ``every``-th frame and the last one."""
-    scene, tensors = _content(file, rollout, every)
+    with np.errstate(invalid="ignore"):  # of a prediction that diverged to infinity
+        scene, tensors = _content(file, rollout, every)
     folder = files("adaptgns.viewer")
     text = {
         name: folder.joinpath(name).read_text("utf-8") for name in ("viewer.html", "viewer.css")
@@ -104,7 +108,8 @@ def _content(
     logarithm = None
     if sigma is not None:
         finite = np.log(np.maximum(sigma, np.finfo(np.float32).tiny), dtype=np.float64)
-        finite = np.where(np.isfinite(finite), finite, np.nanmax(finite[np.isfinite(finite)]))
+        known = np.isfinite(finite)
+        finite = np.where(known, finite, finite[known].max() if known.any() else 0.0)
         # Frame 0 has no sigma yet; it repeats the first one and is never looked at.
         finite = np.concatenate([finite[:1], finite])[shown]
         logarithm = Range(finite.min(), max(finite.max(), finite.min() + 1e-6))
