@@ -6,12 +6,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
-from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
+from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
@@ -21,6 +20,19 @@ from PIL import Image
 from adaptgns._core import adaptive_graph, radius_graph
 from adaptgns.atomic import written_whole
 from adaptgns.metrics import Floats, edge_counts, position_mse
+from adaptgns.palette import (
+    BACKGROUND,
+    BASE_EDGE,
+    EXTRA_EDGE,
+    KINEMATIC,
+    LINE,
+    PANEL,
+    PREDICTED,
+    SIGMA_MAP,
+    SPEED_MAP,
+    TEXT,
+    TRUE,
+)
 from adaptgns.periodic import minimum_image
 from adaptgns.rollout_file import Rollout, RolloutFile
 from adaptgns.view import View
@@ -28,14 +40,6 @@ from adaptgns.view import View
 WIDTH, HEIGHT, DPI = 9.6, 6.6, 100
 """Inches, and pixels per inch"""
 POINTS_PER_INCH = 72
-BACKGROUND, PANEL, LINE, TEXT = "#0a0d13", "#0f131b", "#2b3444", "#aab4c3"
-TRUE, PREDICTED, BASE_EDGE, EXTRA_EDGE, KINEMATIC = (
-    "#57b8cc",
-    "#f0a35e",
-    "#52627d",
-    "#5cf0ba",
-    "#566072",
-)
 SMALL, LARGE = 8, 11
 """Points of the type"""
 MARKER = 0.52
@@ -45,14 +49,6 @@ CLIPPED = (1.0, 99.5)
 COLOURS = 255
 """Of the palette that all pictures share; Pillow takes one more for what stays as it was."""
 PALETTE_PICTURES, RAMP_ROWS = 6, 120
-
-
-def _visible(name: str) -> Colormap:
-    """A perceptually uniform map less its darkest part, which would vanish in the background."""
-    return ListedColormap(colormaps[name](np.linspace(0.2, 1.0, 256)), name)
-
-
-SPEED_MAP, SIGMA_MAP = _visible("viridis"), _visible("inferno")
 
 
 class Animation:

@@ -1,6 +1,7 @@
 """`python -m adaptgns.plot`: pictures of rollouts.
 
 animate: a GIF with the truth on the left and the prediction on the right.
+viewer: an HTML file that plays in any browser.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from rich.console import Console
 from adaptgns.animation import Animation
 from adaptgns.command import plain_errors
 from adaptgns.rollout_file import RolloutFile
+from adaptgns.viewer import write_viewer
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,18 @@ class AnimateConfig:
     """Steps from one picture to the next."""
     fps: int = 25
     """Pictures per second."""
+
+
+@dataclass(frozen=True)
+class ViewerConfig:
+    """Write one trajectory of a rollout file as a page that plays in any browser."""
+
+    rollout: tyro.conf.Positional[Path]
+    """Rollout file (HDF5)."""
+    out: Path
+    """HTML file to write."""
+    trajectory: int = 0
+    """Which trajectory of the file, counted from 0."""
 
 
 def animate(
@@ -52,21 +66,37 @@ def animate(
         Animation(file, file[trajectory], every).write(out, fps)
 
 
+def viewer(rollout: Path, out: Path, *, trajectory: int = 0) -> None:
+    """Write one trajectory of a rollout file to the HTML file ``out``, for any browser.
+
+    The page holds everything it needs; see :mod:`adaptgns.viewer`.
+    """
+    with RolloutFile(rollout) as file:
+        write_viewer(file, file[trajectory], out)
+
+
+Config = AnimateConfig | ViewerConfig
+
+
+def run(config: Config) -> None:
+    """Make what ``config`` asks for."""
+    match config:
+        case AnimateConfig(rollout, out, trajectory, every, fps):
+            animate(rollout, out, trajectory=trajectory, every=every, fps=fps)
+        case ViewerConfig(rollout, out, trajectory):
+            viewer(rollout, out, trajectory=trajectory)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
-    config = tyro.extras.subcommand_cli_from_dict(
-        {"animate": AnimateConfig}, args=argv, prog="python -m adaptgns.plot"
+    config: Config = tyro.extras.subcommand_cli_from_dict(
+        {"animate": AnimateConfig, "viewer": ViewerConfig},
+        args=argv,
+        prog="python -m adaptgns.plot",
     )
-    console = Console()
     with plain_errors(IndexError):
-        animate(
-            config.rollout,
-            config.out,
-            trajectory=config.trajectory,
-            every=config.every,
-            fps=config.fps,
-        )
-    console.print(str(config.out), highlight=False, soft_wrap=True)
+        run(config)
+    Console().print(str(config.out), highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

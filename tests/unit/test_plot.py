@@ -12,7 +12,7 @@ from PIL import Image
 
 from adaptgns.animation import Animation
 from adaptgns.data.metadata import Metadata
-from adaptgns.plot import animate, main
+from adaptgns.plot import animate, main, viewer
 from adaptgns.rollout_file import RolloutFile
 from adaptgns.view import View
 from tests.unit.rollouts import write_rollout
@@ -110,6 +110,55 @@ def test_command(tmp_path: Path, adaptive: Path, capsys: pytest.CaptureFixture[s
             main(["animate", "--rollout", str(adaptive), "--out", str(out), *wrong])
         assert stopped.value.code == 2
     assert "error: every, fps: got 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--out", "a.gif"], "out: got a.gif; a file called .html is accepted"),
+        (["--out", "a.html", "--trajectory", "2"], "trajectory: got 2; "),
+        (["--out", "a.html", "--trajectory", "-1"], "trajectory: got -1; "),
+    ],
+)
+def test_viewer_refuses(
+    tmp_path: Path,
+    adaptive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    told: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        main(["viewer", str(adaptive), *arguments])
+    assert stopped.value.code == 2
+    assert f"error: {told}" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_viewer_refuses_a_scene_that_predicts_nothing(tmp_path: Path, adaptive: Path) -> None:
+    with h5py.File(adaptive, "r+") as file:
+        file["00000/particle_type"][:] = 3
+    with pytest.raises(ValueError, match=r"trajectory block 0 .*has kinematic particles only"):
+        viewer(adaptive, tmp_path / "a.html")
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+def test_viewer_shows_what_diverged(tmp_path: Path, metadata: Metadata, periodic: bool) -> None:
+    path = write_rollout(tmp_path / "a.h5", replace(metadata, periodic=(periodic, False)))
+    with h5py.File(path, "r+") as file:
+        file["00000/predicted"][4:] = np.inf
+        file["00000/sigma"][:] = np.nan
+    viewer(path, tmp_path / "a.html")
+
+
+def test_viewer_page_is_whole_by_itself(tmp_path: Path, adaptive: Path) -> None:
+    viewer(adaptive, tmp_path / "a.html")
+    page = (tmp_path / "a.html").read_text("utf-8")
+    assert not [word for word in ("http", "src=", "href=", "import(", "fetch(") if word in page]
+    assert "{{" not in page
+    viewer(adaptive, tmp_path / "b.html")
+    assert (tmp_path / "b.html").read_text("utf-8") == page
 
 
 def in_three_dimensions(metadata: Metadata) -> Metadata:
