@@ -2,6 +2,7 @@
 
 animate: a GIF with the truth on the left and the prediction on the right.
 viewer: an HTML file that plays in any browser.
+figures: curves of one run or several, for a page.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from rich.console import Console
 
 from adaptgns.animation import Animation
 from adaptgns.command import plain_errors
+from adaptgns.figures import write_figures
 from adaptgns.rollout_file import RolloutFile
 from adaptgns.viewer import write_viewer
 
@@ -47,6 +49,16 @@ class ViewerConfig:
     """Which trajectory of the file, counted from 0."""
 
 
+@dataclass(frozen=True)
+class FiguresConfig:
+    """Figures of runs as PNG and PDF: training, errors and edges per step, calibration, Pareto."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders that train or evaluate wrote."""
+    out: Path
+    """Folder for the figures."""
+
+
 def animate(
     rollout: Path, out: Path, *, trajectory: int = 0, every: int = 4, fps: int = 25
 ) -> None:
@@ -75,7 +87,7 @@ def viewer(rollout: Path, out: Path, *, trajectory: int = 0) -> None:
         write_viewer(file, file[trajectory], out)
 
 
-Config = AnimateConfig | ViewerConfig
+Config = AnimateConfig | ViewerConfig | FiguresConfig
 
 
 def run(config: Config) -> None:
@@ -85,12 +97,14 @@ def run(config: Config) -> None:
             animate(rollout, out, trajectory=trajectory, every=every, fps=fps)
         case ViewerConfig(rollout, out, trajectory):
             viewer(rollout, out, trajectory=trajectory)
+        case FiguresConfig(runs, out):
+            write_figures(runs, out)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
     config: Config = tyro.extras.subcommand_cli_from_dict(
-        {"animate": AnimateConfig, "viewer": ViewerConfig},
+        {"animate": AnimateConfig, "viewer": ViewerConfig, "figures": FiguresConfig},
         args=argv,
         prog="python -m adaptgns.plot",
     )
