@@ -3,6 +3,7 @@
 animate: a GIF with the truth on the left and the prediction on the right.
 viewer: an HTML file that plays in any browser.
 figures: curves of one run or several, for a page.
+vtk: frames and graphs that ParaView opens.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from adaptgns.command import plain_errors
 from adaptgns.figures import write_figures
 from adaptgns.rollout_file import RolloutFile
 from adaptgns.viewer import write_viewer
+from adaptgns.vtk_series import write_series
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,20 @@ class FiguresConfig:
     """Folder for the figures."""
 
 
+@dataclass(frozen=True)
+class VtkConfig:
+    """Write one trajectory of a rollout file as VTK series that ParaView opens."""
+
+    rollout: tyro.conf.Positional[Path]
+    """Rollout file (HDF5)."""
+    out: Path
+    """Folder for truth.pvd, prediction.pvd and graph.pvd, and for the frames they name."""
+    trajectory: int = 0
+    """Which trajectory of the file, counted from 0."""
+    every: int = 1
+    """Steps from one frame to the next."""
+
+
 def animate(
     rollout: Path, out: Path, *, trajectory: int = 0, every: int = 4, fps: int = 25
 ) -> None:
@@ -87,7 +103,14 @@ def viewer(rollout: Path, out: Path, *, trajectory: int = 0) -> None:
         write_viewer(file, file[trajectory], out)
 
 
-Config = AnimateConfig | ViewerConfig | FiguresConfig
+def vtk(rollout: Path, out: Path, *, trajectory: int = 0, every: int = 1) -> None:
+    """Write one trajectory of a rollout file as VTK series into the folder ``out``, every
+    ``every``-th step and the last; see :mod:`adaptgns.vtk_series`."""
+    with RolloutFile(rollout) as file:
+        write_series(file, file[trajectory], out, every)
+
+
+Config = AnimateConfig | ViewerConfig | FiguresConfig | VtkConfig
 
 
 def run(config: Config) -> None:
@@ -99,16 +122,23 @@ def run(config: Config) -> None:
             viewer(rollout, out, trajectory=trajectory)
         case FiguresConfig(runs, out):
             write_figures(runs, out)
+        case VtkConfig(rollout, out, trajectory, every):
+            vtk(rollout, out, trajectory=trajectory, every=every)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
     config: Config = tyro.extras.subcommand_cli_from_dict(
-        {"animate": AnimateConfig, "viewer": ViewerConfig, "figures": FiguresConfig},
+        {
+            "animate": AnimateConfig,
+            "viewer": ViewerConfig,
+            "figures": FiguresConfig,
+            "vtk": VtkConfig,
+        },
         args=argv,
         prog="python -m adaptgns.plot",
     )
-    with plain_errors(IndexError):
+    with plain_errors(IndexError, ImportError):
         run(config)
     Console().print(str(config.out), highlight=False, soft_wrap=True)
 
