@@ -12,7 +12,7 @@ COMMANDS = {
     "generate": "make a data set with the embedded solver",
     "convert": "data sets and checkpoints from and to other formats",
     "inspect": "graph statistics, advice on the radius, problems of a data set",
-    "plot": "animate a rollout, or make a page of it that plays in a browser",
+    "plot": "GIF, browser page or VTK series of a rollout; figures of runs",
 }
 
 

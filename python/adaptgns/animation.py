@@ -17,9 +17,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from numpy.typing import NDArray
 from PIL import Image
 
-from adaptgns._core import adaptive_graph, radius_graph
 from adaptgns.atomic import written_whole
 from adaptgns.metrics import Floats, edge_counts, position_mse
+from adaptgns.next_graph import next_graph
 from adaptgns.palette import (
     BACKGROUND,
     BASE_EDGE,
@@ -195,7 +195,9 @@ class Animation:
         positions = self._predicted[row]
         self._true_cloud.update(row, self._true[row])
         self._cloud.update(row, positions)
-        base, extra = self._edges(row)
+        # The next step starts from this row's positions with this row's sigma.
+        sigma = None if self._sigma is None else self._sigma[row]
+        base, extra = next_graph(self._file, positions, sigma, self._mobile)
         self._base_lines.set_segments(list(self._view.segments(positions, base)))
         self._extra_lines.set_segments(list(self._view.segments(positions, extra)))
         self._step.set_text(f"step {row + 1} of {self._steps}")
@@ -203,28 +205,6 @@ class Animation:
         self._lost.set_text(f"{lost:,} out of sight" if lost else "")
         for cursor in self._cursors:
             cursor.set_xdata([row + 1, row + 1])
-
-    def _edges(self, row: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """``[2, E]`` edges within the base radius, and those beyond it, that the next step sees.
-
-        The next step starts from this row's positions with this row's sigma.
-        """
-        positions, radius = self._predicted[row], self._file.graph_radius
-        if not self._extra_edges or self._sigma is None:
-            return radius_graph(positions, radius, box=self._box), np.empty((2, 0), dtype=np.int64)
-        edges = adaptive_graph(
-            positions,
-            self._sigma[row],
-            radius,
-            self._file.tau,
-            self._file.factor,
-            box=self._box,
-            eligible=self._mobile,
-        )
-        length = np.linalg.norm(
-            minimum_image(positions[edges[0]] - positions[edges[1]], self._box), axis=1
-        )
-        return edges[:, length <= radius], edges[:, length > radius]
 
     def _speeds(self, initial: Floats, positions: Floats) -> NDArray[np.float64]:
         """``[K, N]`` speeds, length per time."""

@@ -2,6 +2,8 @@
 
 animate: a GIF with the truth on the left and the prediction on the right.
 viewer: an HTML file that plays in any browser.
+figures: curves of one run or several, for a page.
+vtk: frames and graphs that ParaView opens.
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ from rich.console import Console
 
 from adaptgns.animation import Animation
 from adaptgns.command import plain_errors
+from adaptgns.figures import write_figures
 from adaptgns.rollout_file import RolloutFile
 from adaptgns.viewer import write_viewer
+from adaptgns.vtk_series import write_series
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,30 @@ class ViewerConfig:
     """Which trajectory of the file, counted from 0."""
 
 
+@dataclass(frozen=True)
+class FiguresConfig:
+    """Figures of runs as PNG and PDF: training, errors and edges per step, calibration, Pareto."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders that train or evaluate wrote."""
+    out: Path
+    """Folder for the figures."""
+
+
+@dataclass(frozen=True)
+class VtkConfig:
+    """Write one trajectory of a rollout file as VTK series that ParaView opens."""
+
+    rollout: tyro.conf.Positional[Path]
+    """Rollout file (HDF5)."""
+    out: Path
+    """Folder for truth.pvd, prediction.pvd and graph.pvd, and for the frames they name."""
+    trajectory: int = 0
+    """Which trajectory of the file, counted from 0."""
+    every: int = 1
+    """Steps from one frame to the next."""
+
+
 def animate(
     rollout: Path, out: Path, *, trajectory: int = 0, every: int = 4, fps: int = 25
 ) -> None:
@@ -75,7 +103,14 @@ def viewer(rollout: Path, out: Path, *, trajectory: int = 0) -> None:
         write_viewer(file, file[trajectory], out)
 
 
-Config = AnimateConfig | ViewerConfig
+def vtk(rollout: Path, out: Path, *, trajectory: int = 0, every: int = 1) -> None:
+    """Write one trajectory of a rollout file as VTK series into the folder ``out``, every
+    ``every``-th step and the last; see :mod:`adaptgns.vtk_series`."""
+    with RolloutFile(rollout) as file:
+        write_series(file, file[trajectory], out, every)
+
+
+Config = AnimateConfig | ViewerConfig | FiguresConfig | VtkConfig
 
 
 def run(config: Config) -> None:
@@ -85,16 +120,25 @@ def run(config: Config) -> None:
             animate(rollout, out, trajectory=trajectory, every=every, fps=fps)
         case ViewerConfig(rollout, out, trajectory):
             viewer(rollout, out, trajectory=trajectory)
+        case FiguresConfig(runs, out):
+            write_figures(runs, out)
+        case VtkConfig(rollout, out, trajectory, every):
+            vtk(rollout, out, trajectory=trajectory, every=every)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
     config: Config = tyro.extras.subcommand_cli_from_dict(
-        {"animate": AnimateConfig, "viewer": ViewerConfig},
+        {
+            "animate": AnimateConfig,
+            "viewer": ViewerConfig,
+            "figures": FiguresConfig,
+            "vtk": VtkConfig,
+        },
         args=argv,
         prog="python -m adaptgns.plot",
     )
-    with plain_errors(IndexError):
+    with plain_errors(IndexError, ImportError):
         run(config)
     Console().print(str(config.out), highlight=False, soft_wrap=True)
 
