@@ -144,6 +144,15 @@ def test_gradients_can_be_taken_twice_of_one_pass() -> None:
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
+def test_nothing_gives_nothing() -> None:
+    network = Case().network
+    graph = Graph.from_edges(torch.zeros(2, 0, dtype=torch.long), torch.zeros(1, dtype=torch.long))
+    prediction = network(torch.zeros(0, 7), torch.zeros(0, 3), graph)
+    prediction.acceleration.sum().backward()
+    assert prediction.acceleration.shape == (0, 2)
+    assert all(not parameter.grad.any() for parameter in network.decoder.parameters())
+
+
 def test_nan_surfaces() -> None:
     made = Case()
     made.node_features[3] = torch.nan

@@ -632,7 +632,7 @@ impl Pass<'_> {
                 }
                 sum
             });
-        total(sums)
+        total(sums, mlp)
     }
 
     /// Gradients of an edge perceptron's parameters (0 but for the node parts of its first map) by
@@ -675,7 +675,7 @@ impl Pass<'_> {
             }
             sum
         });
-        total(sums)
+        total(sums, mlp)
     }
 }
 
@@ -781,7 +781,7 @@ fn edges_backward(
         }
         sum
     });
-    total(sums)
+    total(sums, mlp)
 }
 
 /// How many edges and how many nodes each part has.
@@ -792,10 +792,10 @@ fn part_lengths(parts: &[Part]) -> (Vec<usize>, Vec<usize>) {
         .unzip()
 }
 
-/// The sum of the parts' sums, in order.
-fn total(sums: Vec<Buffer>) -> Buffer {
+/// The sum of the parts' sums, in order; of no parts, 0 for each parameter of `mlp`.
+fn total(sums: Vec<Buffer>, mlp: &Mlp<'_>) -> Buffer {
     let mut sums = sums.into_iter();
-    let mut total = sums.next().unwrap_or_default();
+    let mut total = (sums.next()).unwrap_or_else(|| Buffer::zeros(mlp.parameters()));
     for sum in sums {
         rows::add(&mut total, &sum);
     }
