@@ -246,6 +246,17 @@ def test_edges_can_be_shown_each_kind_alone(adaptive: Path, show: Open) -> None:
     assert len({kind.tobytes() for kind in kinds}) == 4
 
 
+def test_the_picture_keeps_its_proportions_when_the_page_changes(
+    adaptive: Path, show: Open
+) -> None:
+    page = show(adaptive)
+    run(page, "element('legend').style.height = '200px'")
+    page.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+    settle(page)
+    canvas = run(page, "const c = viewer.scene.canvas; return [c.height, c.clientHeight]")
+    assert canvas[0] == canvas[1]
+
+
 def test_a_diverged_particle_is_counted_and_not_drawn(adaptive: Path, show: Open) -> None:
     with h5py.File(adaptive, "r+") as file:
         file["00000/predicted"][6:, 5] = np.nan

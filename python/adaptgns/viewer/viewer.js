@@ -18,7 +18,7 @@ class Viewer {
     this.makeControls();
     this.describe();
     this.refresh();
-    new ResizeObserver(() => this.refresh()).observe(document.body);
+    new ResizeObserver(() => this.refresh()).observe(element("stage"));
   }
 
   describe() {
