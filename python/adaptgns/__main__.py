@@ -11,7 +11,7 @@ COMMANDS = {
     "evaluate": "metrics and tables of rollouts",
     "generate": "make a data set with the embedded solver",
     "inspect": "graph statistics, advice on the radius, problems of a data set",
-    "plot": "animate a rollout",
+    "plot": "a rollout as a GIF, a page to play with or VTK; figures of runs",
 }
 
 

@@ -175,14 +175,14 @@ class Viewer {
     const graph = element("edges").checked || element("extra").checked ? graphOf(rollout, frame) : null;
     const edges = [];
     if (graph && element("edges").checked) edges.push([graph.base, palette.base, 0.9]);
-    if (graph && element("extra").checked) edges.push([graph.extra, palette.extra, 0.55]);
+    if (graph && element("extra").checked) edges.push([graph.extra, palette.extra, 0.7]);
     const truth = {
       codes: rollout.codes("true", frame), edges: [], plain: palette.true, opacity: over ? 0.5 : 1, glow: 0,
       values: this.values(over || colour === "sigma" || colour === "error" ? "plain" : colour, "true"),
     };
     const prediction = {
       codes: rollout.codes("predicted", frame), edges, plain: palette.predicted, opacity: 1,
-      glow: colour !== "sigma" ? 0 : rollout.dim === 3 ? 0.1 : 0.5, values: this.values(colour, "predicted"),
+      glow: colour !== "sigma" ? 0 : rollout.dim === 3 ? 0.1 : 0.18, values: this.values(colour, "predicted"),
     };
     this.scene.draw(over
       ? [{ x: 0, width: 1, clouds: [truth, prediction] }]
