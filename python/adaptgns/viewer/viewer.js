@@ -62,6 +62,8 @@ class Viewer {
     element("play").addEventListener("click", () => this.play(!this.playing));
     element("time").addEventListener("input", (event) => this.seek(Number(event.target.value)));
     for (const id of ["colour", "layout", "edges", "extra"]) element(id).addEventListener("change", () => this.refresh());
+    // A menu gives the keys back to the page once a choice is made.
+    for (const id of ["rate", "colour", "layout"]) element(id).addEventListener("change", () => element(id).blur());
     document.addEventListener("keydown", (event) => this.key(event));
     const canvas = element("particles");
     canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
@@ -92,6 +94,9 @@ class Viewer {
 
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
+    // What has the focus answers to some keys itself.
+    const focus = event.target.tagName, toggles = focus === "BUTTON" || event.target.type === "checkbox";
+    if (focus === "SELECT" || (toggles && event.key === " ")) return;
     const last = this.rollout.frames.length - 1, stride = event.shiftKey ? 10 : 1;
     const cycle = (id, by) => {
       const select = element(id), count = select.options.length;
