@@ -17,10 +17,11 @@ from PIL import Image
 from adaptgns import palette, viewer
 from adaptgns._core import adaptive_graph, radius_graph
 from adaptgns.data.metadata import Metadata
+from adaptgns.data.trajectory import Trajectory
 from adaptgns.metrics import position_mse
 from adaptgns.plot import main
-from adaptgns.rollout_file import RolloutFile
-from tests.unit.rollouts import write_rollout
+from adaptgns.rollout_file import RolloutFile, RolloutWriter
+from tests.unit.rollouts import Step, settings, write_rollout
 
 RULE = {"tau": 70.0, "factor": 1.6}
 Open = Callable[[Path], Any]
@@ -131,10 +132,20 @@ def test_it_plays_to_the_end_and_from_the_start_again(adaptive: Path, show: Open
         "? done() : setTimeout(look, 20); look();"
     )
     assert text(page, "play") == "play"
-    page.execute_script("viewer.play(true)")
-    assert page.execute_script("return viewer.frame") == 0
-    press(page, " ")
+    # The button still has the focus, and answers to the key itself; the page must not do so, too.
+    run(page, "element('rate').value = 8")
+    assert run(page, "return document.activeElement.id") == "play"
+    page.switch_to.active_element.send_keys(" ")
+    assert page.execute_script("return [viewer.playing, viewer.frame < 12]") == [True, True]
+    page.execute_script("document.activeElement.blur()")
+    page.find_element("tag name", "body").send_keys(" ")
     assert not page.execute_script("return viewer.playing")
+    # A menu gives the keys back once a choice is made.
+    menu = page.find_element("id", "colour")
+    pytest.importorskip("selenium.webdriver.support.ui").Select(menu).select_by_value("speed")
+    page.switch_to.active_element.send_keys("\ue010")  # end
+    settle(page)
+    assert page.execute_script("return [viewer.frame, element('colour').value]") == [12, "speed"]
 
 
 def test_a_particle_is_drawn_where_it_is_in_the_colour_of_its_sigma(
@@ -227,6 +238,85 @@ def test_the_page_finds_the_edges_that_the_next_step_sees(
     assert run(page, script.format(0))[1] == 0
 
 
+@pytest.fixture
+def solid(tmp_path: Path, metadata: Metadata) -> Path:
+    """A cloud in 3D that keeps its shape, under the adaptive policy."""
+    names = ("velocity_mean", "velocity_std", "acceleration_mean", "acceleration_std")
+    metadata = replace(
+        metadata,
+        dim=3,
+        bounds=((0.1, 0.9), (0.1, 0.9), (0.1, 1.3)),
+        periodic=(False,) * 3,
+        **{name: (1.0, 1.0, 1.0) for name in names},
+    )
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform(0.3, 0.6, (1, 80, 3)) + np.arange(9)[:, None, None] * 0.01
+    trajectory = Trajectory("cloud", cloud.astype(np.float32), np.full(80, 5))
+    rule = settings(policy="adaptive", adaptive=RULE, trained_radius=0.08)
+    with RolloutWriter(tmp_path / "solid.h5", metadata=metadata, settings=rule) as writer:
+        writer.add(
+            trajectory,
+            (
+                Step(positions, rng.uniform(0.1, 2.0, 80).astype(np.float32), np.zeros(80))
+                for positions in trajectory.positions[6:]
+            ),
+        )
+    return tmp_path / "solid.h5"
+
+
+def test_three_dimensions_turn_under_the_mouse(solid: Path, show: Open) -> None:
+    page = show(solid)
+    press(page, "End")
+    first = picture(page)
+    canvas = page.find_element("id", "particles")
+    actions = pytest.importorskip("selenium.webdriver").ActionChains(page)
+    actions.drag_and_drop_by_offset(canvas, 90, 40).perform()
+    settle(page)
+    assert run(page, "return viewer.scene.yaw") != 0.52
+    assert not np.array_equal(picture(page), first)
+    press(page, "0")
+    np.testing.assert_array_equal(picture(page), first)
+    # Straight from the front and without perspective: x to the right, y up.
+    codes = "Array.from(viewer.rollout.codes('predicted', 3))"
+    script = (
+        "Object.assign(viewer.scene, {yaw: 0, pitch: 0}); viewer.draw(); const s = viewer.scene, "
+        f"p = s.project(viewer.rollout.codes('predicted', 3)); return [{codes}, s.scale, "
+        "Array.from(p.x), Array.from(p.y), Array.from(p.near)]"
+    )
+    packed, scale, x, y, near = run(page, script)
+    with RolloutFile(solid) as file:
+        positions = file[0].predicted[2]
+    np.testing.assert_allclose(np.diff(x), np.diff(positions[:, 0]) * scale, atol=0.05)
+    np.testing.assert_allclose(np.diff(y), -np.diff(positions[:, 1]) * scale, atol=0.05)
+    assert (np.argsort(near) == np.argsort(np.reshape(packed, (-1, 3))[:, 2])).mean() > 0.9
+    # The graph of the next step, of positions that are rounded.
+    with RolloutFile(solid) as file:
+        sigma = file[0].sigma
+    assert sigma is not None
+    edges = adaptive_graph(positions.astype(float), sigma[2].astype(float), 0.08, 70, 1.6)
+    counted = run(page, "const g = graphOf(viewer.rollout, 3); return [g.baseCount, g.extraCount]")
+    assert 2 * sum(counted) == edges.shape[1]
+    assert 2 * counted[0] == radius_graph(positions.astype(float), 0.08).shape[1]
+
+
+def test_wheel_and_drag_move_a_flat_scene(adaptive: Path, show: Open) -> None:
+    page = show(adaptive)
+    first = picture(page)
+    canvas = page.find_element("id", "particles")
+    chain = pytest.importorskip("selenium.webdriver").ActionChains
+    origin = pytest.importorskip("selenium.webdriver.common.actions.wheel_input").ScrollOrigin
+    chain(page).scroll_from_origin(origin.from_element(canvas), 0, -300).perform()
+    settle(page)
+    zoomed = picture(page)
+    chain(page).drag_and_drop_by_offset(canvas, 60, 0).perform()
+    settle(page)
+    assert run(page, "return viewer.scene.zoom") > 1.5
+    assert not np.array_equal(zoomed, first)
+    assert not np.array_equal(picture(page), zoomed)
+    press(page, "0")
+    np.testing.assert_array_equal(picture(page), first)
+
+
 def test_edges_can_be_shown_each_kind_alone(adaptive: Path, show: Open) -> None:
     page = show(adaptive)
     press(page, "ArrowRight")
@@ -244,6 +334,17 @@ def test_edges_can_be_shown_each_kind_alone(adaptive: Path, show: Open) -> None:
         press(page, "c")
         kinds.append(picture(page))
     assert len({kind.tobytes() for kind in kinds}) == 4
+
+
+def test_the_picture_keeps_its_proportions_when_the_page_changes(
+    adaptive: Path, show: Open
+) -> None:
+    page = show(adaptive)
+    run(page, "element('legend').style.height = '200px'")
+    page.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+    settle(page)
+    canvas = run(page, "const c = viewer.scene.canvas; return [c.height, c.clientHeight]")
+    assert canvas[0] == canvas[1]
 
 
 def test_a_diverged_particle_is_counted_and_not_drawn(adaptive: Path, show: Open) -> None:

@@ -105,10 +105,10 @@ class Scene {
     const seen = this.project(cloud.codes), count = seen.x.length;
     const order = new Uint32Array(count).map((_, i) => i);
     if (this.solid) order.sort((i, j) => seen.near[i] - seen.near[j]);
-    for (const [pairs, colour, opacity] of cloud.edges) this.lines(seen, pairs, colour, opacity);
     const plain = rgb(cloud.plain), halo = cloud.glow && this.halo();
-    // In 2D all glows lie under all particles; in 3D what is nearer hides what is behind it.
+    // In 2D all glows lie under all edges and particles; in 3D what is nearer hides what is behind.
     if (halo && !this.solid) for (const i of order) this.glow(seen, i, cloud, halo);
+    for (const [pairs, colour, opacity] of cloud.edges) this.lines(seen, pairs, colour, opacity);
     for (const i of order) {
       if (halo && this.solid) this.glow(seen, i, cloud, halo);
       this.disc(seen, i, cloud.values[i], plain, cloud.opacity);

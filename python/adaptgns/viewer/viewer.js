@@ -18,7 +18,7 @@ class Viewer {
     this.makeControls();
     this.describe();
     this.refresh();
-    new ResizeObserver(() => this.refresh()).observe(document.body);
+    new ResizeObserver(() => this.refresh()).observe(element("stage"));
   }
 
   describe() {
@@ -62,6 +62,8 @@ class Viewer {
     element("play").addEventListener("click", () => this.play(!this.playing));
     element("time").addEventListener("input", (event) => this.seek(Number(event.target.value)));
     for (const id of ["colour", "layout", "edges", "extra"]) element(id).addEventListener("change", () => this.refresh());
+    // A menu gives the keys back to the page once a choice is made.
+    for (const id of ["rate", "colour", "layout"]) element(id).addEventListener("change", () => element(id).blur());
     document.addEventListener("keydown", (event) => this.key(event));
     const canvas = element("particles");
     canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
@@ -92,6 +94,9 @@ class Viewer {
 
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
+    // What has the focus answers to some keys itself.
+    const focus = event.target.tagName, toggles = focus === "BUTTON" || event.target.type === "checkbox";
+    if (focus === "SELECT" || (toggles && event.key === " ")) return;
     const last = this.rollout.frames.length - 1, stride = event.shiftKey ? 10 : 1;
     const cycle = (id, by) => {
       const select = element(id), count = select.options.length;
@@ -175,14 +180,14 @@ class Viewer {
     const graph = element("edges").checked || element("extra").checked ? graphOf(rollout, frame) : null;
     const edges = [];
     if (graph && element("edges").checked) edges.push([graph.base, palette.base, 0.9]);
-    if (graph && element("extra").checked) edges.push([graph.extra, palette.extra, 0.55]);
+    if (graph && element("extra").checked) edges.push([graph.extra, palette.extra, 0.7]);
     const truth = {
       codes: rollout.codes("true", frame), edges: [], plain: palette.true, opacity: over ? 0.5 : 1, glow: 0,
       values: this.values(over || colour === "sigma" || colour === "error" ? "plain" : colour, "true"),
     };
     const prediction = {
       codes: rollout.codes("predicted", frame), edges, plain: palette.predicted, opacity: 1,
-      glow: colour !== "sigma" ? 0 : rollout.dim === 3 ? 0.1 : 0.5, values: this.values(colour, "predicted"),
+      glow: colour !== "sigma" ? 0 : rollout.dim === 3 ? 0.1 : 0.18, values: this.values(colour, "predicted"),
     };
     this.scene.draw(over
       ? [{ x: 0, width: 1, clouds: [truth, prediction] }]
