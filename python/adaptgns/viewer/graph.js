@@ -72,19 +72,19 @@ function graphOf(rollout, frame) {
   const high = highParticles(rollout, frame);
   const anyHigh = high.includes(1);
   const far = anyHigh ? radius * rollout.adaptive.factor : radius;
-  const cells = new Cells(rollout, codes, far);
+  const cells = new Cells(rollout, codes, far), { of, start, members } = cells;
   const around = new Map();
   const at = Float64Array.from(codes, (code, k) => code * extent[k % dim] / LARGEST);
   const base = [], extra = [];
   let baseCount = 0, extraCount = 0;
   for (let i = 0; i < particles; i++) {
-    const cell = cells.of[i];
+    const cell = of[i];
     if (cell < 0) continue;
     if (!around.has(cell)) around.set(cell, cells.around(cell));
     for (const other of around.get(cell)) {
-      for (let k = cells.start[other]; k < cells.start[other + 1]; k++) {
-        const j = cells.members[k];
-        if (j <= i) continue;
+      for (let k = start[other + 1] - 1; k >= start[other]; k--) {
+        const j = members[k];
+        if (j <= i) break;  // a cell's members are in their order
         let square = 0, wraps = false;
         for (let axis = 0; axis < dim; axis++) {
           let d = at[i * dim + axis] - at[j * dim + axis];
