@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, repeat
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ from adaptgns.palette import (
 )
 from adaptgns.periodic import minimum_image
 from adaptgns.rollout_file import Rollout, RolloutFile
+from adaptgns.video import write_mp4
 from adaptgns.view import View
 
 WIDTH, HEIGHT, DPI = 9.6, 6.6, 100
@@ -83,13 +85,26 @@ class Animation:
         )
 
     def write(self, path: Path, fps: int) -> None:
-        """Write the GIF ``path``, whole or not at all."""
+        """Write the GIF or MP4 ``path``, whole or not at all; the last picture stays a second.
+
+        ValueError for another suffix, ImportError for an MP4 without imageio-ffmpeg.
+        """
+        match path.suffix.lower():
+            case ".gif":
+                self._write_gif(path, fps)
+            case ".mp4":
+                last = repeat(self.shown[-1], fps - 1)
+                size = self._canvas.get_width_height()
+                write_mp4(path, self.pictures(chain(self.shown, last)), size, fps)
+            case _:
+                raise ValueError(f"out: got {path}; accepted are names that end in .gif or .mp4")
+
+    def _write_gif(self, path: Path, fps: int) -> None:
         palette = self._palette()
         frames = (
             Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
             for picture in self.pictures(self.shown)
         )
-        # The last picture stays for a second before the animation starts over.
         duration = [1000 // fps] * (len(self.shown) - 1) + [1000]
         with written_whole(path) as partial:
             next(frames).save(

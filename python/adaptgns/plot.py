@@ -1,6 +1,6 @@
 """`python -m adaptgns.plot`: pictures of rollouts.
 
-animate: a GIF with the truth on the left and the prediction on the right.
+animate: a GIF or MP4 with the truth on the left and the prediction on the right.
 viewer: an HTML file that plays in any browser.
 figures: curves of one run or several, for a page.
 vtk: frames and graphs that ParaView opens.
@@ -30,7 +30,7 @@ class AnimateConfig:
     rollout: Path
     """Rollout file (HDF5)."""
     out: Path
-    """GIF file to write."""
+    """GIF or MP4 file to write."""
     trajectory: int = 0
     """Which trajectory of the file, counted from 0."""
     every: int = 4
@@ -78,7 +78,7 @@ class VtkConfig:
 def animate(
     rollout: Path, out: Path, *, trajectory: int = 0, every: int = 4, fps: int = 25
 ) -> None:
-    """Write an animation of one trajectory of a rollout file to the GIF ``out``.
+    """Write an animation of one trajectory of a rollout file to ``out``, .gif or .mp4.
 
     Particles of the truth are coloured by their speed, those of the prediction by their sigma (by
     speed too, for a model without a variance head), both scales fixed over the animation. For the

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from adaptgns import video
 from adaptgns.animation import Animation
 from adaptgns.data.metadata import Metadata
 from adaptgns.plot import animate, main, viewer
@@ -52,6 +55,57 @@ def test_gif_has_every_nth_step_and_the_last(tmp_path: Path, adaptive: Path) -> 
     assert all(len(colours(panel(frame, right))) > 20 for frame in frames for right in (0, 1))
     assert not np.array_equal(panel(frames[0], False), panel(frames[2], False))
     assert not np.array_equal(panel(frames[0], True), panel(frames[2], True))
+
+
+def test_mp4_shows_the_pictures_of_the_gif(tmp_path: Path, adaptive: Path) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is missing")
+    animate(adaptive, tmp_path / "new" / "a.mp4", every=5, fps=20)
+    film = str(tmp_path / "new" / "a.mp4")
+    decode = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", film, "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    decoded = subprocess.run([*decode, "-"], capture_output=True, check=True)
+    for expected in (b"h264", b"yuv420p", b"960x660", b"20 fps"):
+        assert expected in decoded.stderr
+    frames = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 660, 960, 3).astype(int)
+    # Steps 5, 10 and 12, the last for a second.
+    assert len(frames) == 22
+    for frame, row in ((0, 4), (1, 9), (2, 11), (21, 11)):
+        drawn = picture(adaptive, row)
+        others = [np.abs(picture(adaptive, other) - frames[frame]).mean() for other in (2, 6)]
+        # Lossy, and with a fourth of the colours; another step is farther away.
+        assert np.abs(drawn - frames[frame]).mean() < min(3, *others)
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.mp4"]
+
+
+@pytest.mark.parametrize("fails", ["at once", "at the end"])
+def test_a_film_that_cannot_be_encoded_does_not_appear(
+    tmp_path: Path, adaptive: Path, monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    program = tmp_path / "ffmpeg"
+    reading = "cat > /dev/null" if fails == "at the end" else ""
+    program.write_text(f"#!/bin/sh\n{reading}\necho 'no space left' >&2\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(video, "_ffmpeg", lambda: str(program))
+    with pytest.raises(OSError, match=r"a\.mp4: ffmpeg could not write it: no space left"):
+        animate(adaptive, tmp_path / "film" / "a.mp4", every=5)
+    assert not list((tmp_path / "film").iterdir())
+
+
+def test_without_its_package_or_with_another_suffix_no_film(
+    tmp_path: Path,
+    adaptive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    told = {
+        "a.mp4": "imageio-ffmpeg, which is not installed: pip install 'adaptgns[video]'",
+        "a.avi": "a.avi; accepted are names that end in .gif or .mp4",
+    }
+    for name, message in told.items():
+        with pytest.raises(SystemExit, match="2"):
+            main(["animate", "--rollout", str(adaptive), "--out", str(tmp_path / name)])
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / name).exists()
 
 
 def test_sigma_colours_the_prediction_alone(tmp_path: Path, metadata: Metadata) -> None:
