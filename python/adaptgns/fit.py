@@ -41,7 +41,8 @@ from adaptgns.network import Prediction
 from adaptgns.processes import ALONE, Processes
 from adaptgns.rollout import to_sigma
 from adaptgns.segment import Graph
-from adaptgns.validation import validate
+from adaptgns.snapshot import snapshot
+from adaptgns.validation import Validation, validate
 from adaptgns.windows import Batch, Windows, training_batches
 
 LOG_EVERY = 100
@@ -330,9 +331,11 @@ class Trainer:
     def _validate(self, log: Log) -> None:
         assert self.valid is not None
         self.simulator.eval()
-        scores = validate(self.simulator, self.valid, self.config)
+        validation = validate(self.simulator, self.valid, self.config)
         self.simulator.train()
+        scores = validation.scores
         log.write(self.step, scores)
+        log.show(self.step, self.metadata, validation)
         c = self.config
         first_settled = (
             c.schedule == "cosine" and self.step >= SETTLED * c.steps > self.step - c.validate_every
@@ -368,6 +371,12 @@ class Log:
         self.file.flush()
         for name, value in values.items():
             self.board.add_scalar(name, value, step)
+
+    def show(self, step: int, metadata: Metadata, validation: Validation) -> None:
+        """Put a picture of the rollout on the TensorBoard."""
+        v = validation
+        picture = snapshot(metadata, v.true, v.predicted, v.sigma, v.mobile)
+        self.board.add_image("valid_rollout", picture, step, dataformats="HWC")
 
     def __enter__(self) -> Log:
         return self

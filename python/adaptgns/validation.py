@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,7 +24,22 @@ COLLAPSED = 20
 """How many times the edges of the first step mean that a rollout has collapsed"""
 
 
-def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> dict[str, float]:
+@dataclass(frozen=True)
+class Validation:
+    """What was measured, and the first trajectory's rollout to look at."""
+
+    scores: dict[str, float]
+    true: NDArray[np.float32]
+    """``[K, N, d]``"""
+    predicted: NDArray[np.float32]
+    """``[K, N, d]``, K fewer where it collapsed"""
+    sigma: NDArray[np.float32] | None
+    """``[K, N]`` of ``predicted``, normalized units; None without a variance head"""
+    mobile: NDArray[np.bool_]
+    """``[N]``"""
+
+
+def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> Validation:
     """One-step and rollout errors on the base graph, from true inputs without noise.
 
     - ``valid_loss`` and ``valid_one_step_mse`` (normalized accelerations, mean over particles and
@@ -46,15 +61,18 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
             losses.append(float(training_loss(config.loss, prediction, target, batch.mobile)))
             errors.append(float(training_loss("mse", prediction, target, batch.mobile)))
 
-    curves = []
+    curves, shown = [], None
     for index in range(min(len(valid), config.validate_trajectories)):
         trajectory = valid[index]
         true = trajectory.positions[HISTORY:][: config.validate_horizon]
         mobile = simulator.metadata.mobile(trajectory.particle_type)
         predicted: list[NDArray[np.float32]] = []
+        sigmas: list[NDArray[np.float32]] = []
         edges = 0
         for step in steps(simulator, trajectory, Fixed(), len(true)):
             predicted.append(step.positions)
+            if step.sigma is not None:
+                sigmas.append(step.sigma)
             edges = edges or step.edges
             if step.edges > COLLAPSED * edges:
                 break
@@ -63,11 +81,14 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
             np.stack(predicted), true[: len(predicted)], mobile, simulator.metadata.box
         )
         curves.append(curve)
+        shown = shown or (true, np.stack(predicted), np.stack(sigmas) if sigmas else None, mobile)
+    assert shown is not None, "a split has a trajectory"
     shortest = min(map(len, curves))
     curve = np.mean([c[:shortest] for c in curves], axis=0)
-    return {
+    scores = {
         "valid_loss": float(np.mean(losses)),
         "valid_one_step_mse": float(np.mean(errors)),
         "valid_rollout_mse": float(curve.mean()),
         **{f"valid_rollout_mse_{k}": float(curve[k - 1]) for k in MARKS if k <= shortest},
     }
+    return Validation(scores, *shown)
