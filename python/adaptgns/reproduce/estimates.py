@@ -127,7 +127,7 @@ def _step(
 
     def both() -> None:
         forward().backward()  # type: ignore[no-untyped-call]
-        float(next(simulator.parameters()).sum())
+        float(next(simulator.parameters()).detach().sum())
 
     return _fastest(alone), _fastest(both)
 
