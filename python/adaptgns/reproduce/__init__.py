@@ -21,6 +21,7 @@ import torch
 import tyro
 from rich.console import Console
 
+from adaptgns.atomic import write_json
 from adaptgns.command import plain_errors
 from adaptgns.config import Device
 from adaptgns.fit import TrainingStopped
@@ -28,7 +29,7 @@ from adaptgns.interruption import interruption
 from adaptgns.reproduce import report
 from adaptgns.reproduce.estimates import seconds
 from adaptgns.reproduce.profiles import PROFILES, ProfileName
-from adaptgns.reproduce.runs import Run, Study, write_json
+from adaptgns.reproduce.runs import Run, Study
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from markdown import markdown
 
-from adaptgns.atomic import replace_text
+from adaptgns.atomic import replace_text, write_json
 from adaptgns.reproduce import figures
 from adaptgns.reproduce.results import Results
-from adaptgns.reproduce.runs import Study, read_json, write_json
+from adaptgns.reproduce.runs import Study, read_json
 from adaptgns.reproduce.tables import Row, Table, tables
 
 CAPTIONS = {

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from adaptgns.atomic import replace_text, written_whole
+from adaptgns.atomic import write_json, written_whole
 from adaptgns.checkpoint import LAST, read_checkpoint
 from adaptgns.config import (
     HISTORY,
@@ -393,14 +393,8 @@ def write_snapshot(rollouts: Path, path: Path) -> None:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
 
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write ``content`` with six significant digits, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    replace_text(path, json.dumps(_six_digits(content), allow_nan=False) + "\n")
-
-
 def read_json(path: Path) -> dict[str, Any]:
-    """What :func:`write_json` wrote; StudyError where there is nothing."""
+    """What :func:`~adaptgns.atomic.write_json` wrote; StudyError where there is nothing."""
     try:
         content: dict[str, Any] = json.loads(path.read_text("utf-8"))
     except FileNotFoundError:
@@ -408,15 +402,3 @@ def read_json(path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise StudyError(f"{path}: not readable as JSON: {error}") from None
     return content
-
-
-def _six_digits(value: Any) -> Any:
-    match value:
-        case dict():
-            return {key: _six_digits(item) for key, item in value.items()}
-        case list():
-            return [_six_digits(item) for item in value]
-        case float():
-            return float(f"{value:.6g}") if math.isfinite(value) else None
-        case _:
-            return value
