@@ -18,7 +18,7 @@ from adaptgns.reproduce.results import Results, estimate
 
 QUIET = Console(quiet=True)
 FIGURES = ("statistics", "graphs", "sigma", "steps", "pareto", "reliability", "clouds")
-TABLES = ("rollouts", "comparisons", "clouds", "along", "calibration")
+TABLES = ("rollouts", "comparisons", "clouds", "sweep", "along", "calibration")
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_every_table_and_figure_is_there(made: ReproduceConfig) -> None:
         assert (folder(made) / "figures" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
         assert (folder(made) / "figures" / f"{name}.pdf").read_bytes()[:5] == b"%PDF-"
     page = (folder(made) / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == len(FIGURES)
+    assert page.count("data:image/png;base64,") == len(FIGURES) + 2, "and a heat map a set"
     assert page.count("<table>") == len(found)
     assert str(folder(made)) not in report + (folder(made) / "tables.json").read_text()
 
@@ -82,6 +82,7 @@ def test_every_number_comes_from_the_files_that_its_row_names(made: ReproduceCon
             rows = [
                 json.loads((folder(made) / file).read_text())["rollouts"][0]
                 for file in row["files"]
+                if not file.endswith("times.json")
             ]
             assert len(rows) == 2, "a file a seed"
             cells = dict(zip(table["columns"], row["cells"], strict=True))
@@ -95,6 +96,22 @@ def test_every_number_comes_from_the_files_that_its_row_names(made: ReproduceCon
                 assert shown == pytest.approx(mean, rel=0.01, abs=0.51 if mean > 10 else 0.006)
                 checked += 1
     assert checked >= 60
+
+
+def test_the_chosen_rule_is_within_the_budget_and_what_is_reported(made: ReproduceConfig) -> None:
+    for data in ("waterdrop", "sand"):
+        metrics = folder(made) / "metrics" / data
+        result = json.loads((metrics / "sweep" / "sweep.json").read_text())
+        chosen, budget = result["chosen"], result["settings"]["edges"]
+        within = [row["mse"] for row in result["trials"] if row["edges"] <= budget]
+        assert chosen["mse"] == min(within)
+        valid = json.loads((metrics / "mse-0-fixed-valid.json").read_text())["rollouts"][0]
+        assert budget == valid["scalars"]["edges_per_step"]["mean"]
+        for seed in (0, 1):
+            row = json.loads((metrics / f"tuned-{seed}-adaptive.json").read_text())["rollouts"][0]
+            assert row["settings"]["radius"] == chosen["radius"]
+            assert row["settings"]["adaptive"]["factor"] == chosen["factor"]
+            assert row["settings"]["training"]["seed"] == seed
 
 
 def test_no_metrics_tell_where_they_were_made(made: ReproduceConfig) -> None:

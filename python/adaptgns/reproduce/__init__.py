@@ -93,22 +93,32 @@ def reproduce(config: ReproduceConfig, console: Console) -> None:
         list_runs(runs, console)
         return
     if not config.report_only:
-        for data in study.sets.values():
-            data.describe()
-            data.pass_gate(console)
-        todo = [run for run in runs if not run.done]
-        if config.jobs == 1:
-            for run in todo:
-                run.do(console)
-        else:
-            in_processes(config, todo, console)
-        if todo:
-            write_json(study.out / "machine.json", _machine())
+        make(config, study, runs, console)
     if config.only == "*":
         for path in report.write(study):
             console.print(str(path), highlight=False, soft_wrap=True)
         if config.readme is not None:
             report.write_into(study, config.readme)
+
+
+def make(config: ReproduceConfig, study: Study, runs: Sequence[Run], console: Console) -> None:
+    """Make those of ``runs`` that are missing, and what is measured beside them."""
+    for data in study.sets.values():
+        data.describe()
+        data.pass_gate(console)
+    todo = [run for run in runs if not run.done]
+    if config.jobs == 1:
+        for run in todo:
+            run.do(console)
+    else:
+        in_processes(config, todo, console)
+    seed = study.profile.seeds[0]
+    for data in study.sets.values():
+        first = [run for run in study.runs() if (run.data, run.seed) == (data, seed)]
+        if all(run.done for run in first):
+            data.time_steps(first)
+    if todo:
+        write_json(study.out / "machine.json", _machine())
 
 
 def list_runs(runs: Sequence[Run], console: Console) -> None:
@@ -136,13 +146,14 @@ def in_processes(config: ReproduceConfig, runs: Sequence[Run], console: Console)
     waiting, failed = list(runs), []
     running: dict[subprocess.Popen[bytes], Run] = {}
     gpus = torch.cuda.device_count() if config.device != "cpu" else 0
-    started = 0
+    started, first = 0, runs[0].study.profile.seeds[0] if runs else 0
     with interruption() as interrupted:
         while waiting or running:
             while waiting and len(running) < config.jobs and not interrupted:
-                # What depends on other runs comes last, and waits for them.
-                if waiting[0].model.radius == "matched" and any(
-                    run.model.radius != "matched" for run in running.values()
+                # What depends on other runs comes last, and waits for them; the first of it makes
+                # what the rest share.
+                if waiting[0].model.depends and any(
+                    not run.model.depends or run.seed == first for run in running.values()
                 ):
                     break
                 run = waiting.pop(0)

@@ -38,7 +38,9 @@ def seconds(run: Run) -> float:
     factor = 1.0 if model.radius == "matched" else model.radius
     forward, both = _step(base, model.edges, model.loss, samples * train, factor)
     unrolled = 1 + (base.unroll - 1) / 2  # in the second half alone
-    training = model.share * run.data.steps * both * unrolled
+    training = 0.0
+    if model.weights is None:
+        training = model.share * run.data.steps * both * unrolled
     if model.graph == "adaptive":
         training += model.share * run.data.steps * forward
     one, _ = _step(base, model.edges, model.loss, test, factor)

@@ -32,6 +32,7 @@ COLOURS = {
     "nll-adaptive": SERIES[2],
     "beta-nll": SERIES[3],
     "mse-denser": SERIES[4],
+    "tuned": SERIES[2],
 }
 FIGURE_3 = (("mse", "fixed"), ("nll", "fixed"), ("nll", "adaptive"), ("nll", "random"))
 EXTRA_EDGE, BASE_EDGE = "#1fa774", "#c3cad3"
@@ -190,11 +191,12 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                 if not series.model.edges or series.model.share < 1:
                     continue
                 error = series.estimate(f"mse@{mark}")
-                cost = series.scalar("edges_per_step")
+                cost = series.scalar("edges_per_step").mean()
                 if unit.startswith("milli"):
-                    cost = series.scalar("graph_ms") + series.scalar("model_ms")
+                    time = data.times[f"{series.model.name}, {series.policy}"]
+                    cost = time["graph_ms"] + time["model_ms"]
                 ax.errorbar(
-                    cost.mean(),
+                    cost,
                     error.mean,
                     yerr=[[error.mean - error.low], [error.high - error.mean]],
                     color=colour(series),

@@ -36,6 +36,13 @@ class Model:
     share: float = 1.0
     """Of the profile's training steps"""
     policies: tuple[PolicyName, ...] = ("fixed",)
+    weights: str | None = None
+    """Name of the model whose training it uses, under the rule that the sweep chose"""
+
+    @property
+    def depends(self) -> bool:
+        """Whether it comes after the other models."""
+        return self.weights is not None or self.radius == "matched"
 
     def config(self, base: TrainConfig, seed: int, radius: float) -> TrainConfig:
         """Of its training, by the profile's ``base``; ``radius`` is that of the data."""
@@ -58,6 +65,9 @@ class Model:
 MLP = Model("mlp", "MLP", "mse", edges=False)
 MSE = Model("mse", "GNS, MSE", "mse", policies=("fixed", "knn"))
 NLL = Model("nll", "GNS, NLL", "nll", policies=POLICIES)
+TUNED = Model(
+    "tuned", "AdaptGNS, chosen rule", "nll", policies=("adaptive", "random"), weights="nll"
+)
 EARLY = tuple(
     replace(
         NLL,
@@ -83,8 +93,22 @@ PAPER_MODELS = (
         policies=("fixed", "adaptive", "random"),
     ),
     replace(NLL, name="beta-nll", title="GNS, beta-NLL", loss="beta-nll"),
-    replace(MSE, name="mse-matched", title="GNS, MSE, matched r", radius="matched"),
+    replace(
+        MSE, name="mse-matched", title="GNS, MSE, matched r", radius="matched", policies=("fixed",)
+    ),
+    TUNED,
 )
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The rules among which one is chosen on validation."""
+
+    tau: tuple[float, ...] = (50.0, 70.0, 90.0)
+    factor: tuple[float, ...] = (1.1, 1.267, 1.5)
+    radius: tuple[float, ...] = (0.85, 0.925, 1.0)
+    """Times that of the data"""
+    trajectories: int | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +124,7 @@ class Profile:
     """Test trajectories rolled out; None: all"""
     horizon: int | None = None
     """Frames of the rollouts; None: to the end"""
+    sweep: Sweep = Sweep()
     gate: float | None = None
     """Edges on predicted over those on true positions that the fixed graph's baseline must come
     within at the last mark on validation; its training is doubled until then"""
@@ -112,7 +137,8 @@ class Profile:
 PROFILES: dict[ProfileName, Profile] = {
     "smoke": Profile(
         base=replace(PRESETS["smoke"], steps=12, validate_every=12, validate_horizon=5),
-        models=(MSE, NLL, MLP, EARLY[1]),
+        models=(MSE, NLL, MLP, EARLY[1], TUNED),
+        sweep=Sweep(tau=(70.0,), factor=(1.1, 1.267), radius=(0.9, 1.0)),
         seeds=(0, 1),
         marks=(5, 10),
         horizon=10,
@@ -127,7 +153,8 @@ PROFILES: dict[ProfileName, Profile] = {
     ),
     "laptop": Profile(
         base=PRESETS["laptop"],
-        models=(MSE, NLL, MLP, *EARLY),
+        models=(MSE, NLL, MLP, *EARLY, TUNED),
+        sweep=Sweep(trajectories=5),
         seeds=(0, 1, 2),
         marks=(50, 100, 200),
         trajectories=10,

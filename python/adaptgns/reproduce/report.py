@@ -14,6 +14,7 @@ from adaptgns.reproduce import figures
 from adaptgns.reproduce.results import Results
 from adaptgns.reproduce.runs import Study, read_json
 from adaptgns.reproduce.tables import Row, Table, tables
+from adaptgns.sweep import HEAT_MAP
 
 CAPTIONS = {
     "statistics": "Graphs of the true positions, mean and standard deviation over the test set.",
@@ -88,6 +89,12 @@ def _markdown(study: Study, made: list[Table], images: list[Path]) -> str:
         if table.note:
             parts.append(table.note)
     parts.append("## Figures")
+    for data in study.sets.values():
+        heat_map = (data.metrics / "sweep" / f"{HEAT_MAP}.png").relative_to(study.out).as_posix()
+        parts.append(
+            f"![sweep]({heat_map})\n\nThe adaptive rule on {data.name}, validation: error and, "
+            "below it, edges a step."
+        )
     for path in images:
         relative = path.relative_to(study.out).as_posix()
         parts.append(f"![{path.stem}]({relative})\n\n{CAPTIONS[path.stem]}")

@@ -6,7 +6,8 @@ policies, and measures that. Files in the study's folder:
 - ``training/DATA/MODEL-SEED/``: what ``train`` writes; an interrupted run goes on from there
 - ``metrics/DATA/MODEL-SEED-POLICY.json``: what the report is made of, with its configuration
 - ``metrics/DATA/MODEL-SEED-adaptive.npz``: frames of its first trajectory, of one seed, for figures
-- ``metrics/DATA/data.json``: what the data are like; ``gate.json``: how long it had to be trained
+- ``metrics/DATA/data.json``: what the data are like; ``gate.json``: how long it had to be trained;
+  ``sweep/``: the rules that were tried on validation; ``times.json``: milliseconds of a step
 - ``data/``: data sets that are generated for a profile
 """
 
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,12 +28,14 @@ from adaptgns.atomic import write_json, written_whole
 from adaptgns.checkpoint import LAST, read_checkpoint
 from adaptgns.config import (
     HISTORY,
+    AdaptiveConfig,
     Device,
     PolicyName,
     RolloutConfig,
     TrainConfig,
     from_json,
     to_json,
+    torch_device,
 )
 from adaptgns.data.default import EMBEDDED, dataset_folder
 from adaptgns.data.generation import generate_dataset
@@ -40,16 +43,22 @@ from adaptgns.data.metadata import Metadata, read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.evaluate import STATISTICS_STEP, measure
 from adaptgns.graph_statistics import graph_statistics
+from adaptgns.policies import make_policy
 from adaptgns.processes import ALONE
 from adaptgns.reproduce.profiles import ADAPTIVE, DENSER, MSE, NLL, Model, Profile, ProfileName
-from adaptgns.rollout import write_rollouts
+from adaptgns.rollout import Step, steps, write_rollouts
 from adaptgns.rollout_file import RolloutFile
+from adaptgns.sweep import RESULT, SweepConfig, sweep
 from adaptgns.train import train
 
 SNAPSHOTS = (1, 10, 50, 100)
 """Steps whose frames are kept for the figures"""
 EVERY = 10
 """Steps between those of the statistics' evolution"""
+TIMED = 40
+"""Steps that are timed"""
+DRAWN = (NLL.name, "adaptive")
+"""Model and policy whose frames the figures show, of the first seed"""
 LOCAL = {
     *("out", "checkpoint", "data", "resume", "preset", "device", "threads", "workers"),
     *("checkpoint_every", "test_trajectories", "test_horizon"),
@@ -88,7 +97,7 @@ class Study:
             for seed in self.profile.seeds:
                 for data in self.sets.values():
                     for model in self.profile.models:
-                        if (model.radius == "matched") == depends:
+                        if model.depends == depends:
                             yield Run(data, model, seed)
 
     @property
@@ -181,6 +190,83 @@ class DataSet:
             return self.study.profile.base.steps
         return int(read_json(path)["steps"])
 
+    @property
+    def rule(self) -> dict[str, float]:
+        """What the sweep chose."""
+        chosen: dict[str, float] = read_json(self.metrics / "sweep" / RESULT)["chosen"]
+        return chosen
+
+    def choose_rule(self, console: Console) -> None:
+        """Sweep the adaptive rule on validation, with the NLL model of the first seed, within the
+        edges that the fixed graph of the MSE model has there."""
+        folder = self.metrics / "sweep"
+        if (folder / RESULT).exists():
+            return
+        profile, radius = self.study.profile, float(self.described["radius"])
+        seed = profile.seeds[0]
+        run = Run(self, NLL, seed)
+        run.require_training()
+        budget = valid_edges(self, MSE, seed, "fixed")
+        sweep(
+            SweepConfig(
+                checkpoint=run.folder,
+                out=folder,
+                data=str(self.folder),
+                tau=profile.sweep.tau,
+                factor=profile.sweep.factor,
+                radius=tuple(round(share * radius, 6) for share in profile.sweep.radius),
+                edges=budget,
+                steps=self.study.last_mark,
+                trajectories=profile.sweep.trajectories,
+                device=self.study.device,
+            ),
+            console,
+        )
+
+    def time_steps(self, runs: Sequence[Run]) -> None:
+        """Time a step under every model and policy in ``runs``, in turns, on true positions of one
+        test trajectory."""
+        path = self.metrics / "times.json"
+        if path.exists():
+            return
+        trajectory = open_split(self.folder, "test")[0]
+        start = max(0, min(STATISTICS_STEP, len(trajectory.positions) - HISTORY - TIMED))
+        trajectory = replace(trajectory, positions=trajectory.positions[start:])
+        count = min(TIMED, len(trajectory.positions) - HISTORY)
+        rolling: dict[str, Iterator[Step]] = {}
+        for run in runs:
+            simulator = read_checkpoint(run.folder).simulator()
+            simulator = simulator.to(torch_device(self.study.device))
+            for policy in run.model.policies:
+                config = run.rollout_config(policy)
+                rolling[f"{run.model.name}, {policy}"] = steps(
+                    simulator,
+                    trajectory,
+                    make_policy(policy, config.adaptive, k=config.k, seed=config.seed),
+                    count,
+                    radius=config.radius,
+                    teacher_forcing=True,
+                )
+        times: dict[str, list[Step]] = {name: [] for name in rolling}
+        for _ in range(count):
+            for name, each in rolling.items():
+                times[name].append(next(each))
+        write_json(
+            path,
+            {
+                name: {
+                    kind: float(np.median([getattr(step, kind) for step in taken]))
+                    for kind in ("graph_ms", "model_ms", "edges")
+                }
+                for name, taken in times.items()
+            },
+        )
+
+    @property
+    def times(self) -> dict[str, dict[str, float]]:
+        """What :meth:`time_steps` measured."""
+        return read_json(self.metrics / "times.json")
+
     def pass_gate(self, console: Console) -> None:
         """Find how long the fixed graph's baseline must train until it does not clump."""
         profile, path = self.study.profile, self.metrics / "gate.json"
@@ -222,7 +308,14 @@ class Run:
     @property
     def folder(self) -> Path:
         """Of the training."""
-        return self.study.out / "training" / self.name
+        return self.study.out / "training" / self.data.name / f"{self.trained.name}-{self.seed}"
+
+    @property
+    def trained(self) -> Model:
+        """The model whose training it uses, as a rule its own."""
+        if self.model.weights is None:
+            return self.model
+        return next(m for m in self.study.profile.models if m.name == self.model.weights)
 
     def metrics(self, policy: PolicyName) -> Path:
         """What was measured under ``policy``."""
@@ -237,7 +330,7 @@ class Run:
         """Of the training. StudyError where it depends on runs that are missing."""
         base = replace(self.study.profile.base, steps=self.data.steps, data=self.data.source)
         radius = float(self.data.described["radius"])
-        config = self.model.config(base, self.seed, radius)
+        config = self.trained.config(base, self.seed, radius)
         if self.model.radius == "matched":
             matched = matched_radius(self.data, self.seed, radius)
             config = replace(config, model=replace(config.model, radius=matched))
@@ -245,13 +338,17 @@ class Run:
 
     def rollout_config(self, policy: PolicyName) -> RolloutConfig:
         """Of the rollouts under ``policy``."""
-        profile = self.study.profile
+        profile, rule, radius = self.study.profile, ADAPTIVE, None
+        if self.model.weights is not None:
+            chosen = self.data.rule
+            rule, radius = AdaptiveConfig(chosen["tau"], chosen["factor"]), chosen["radius"]
         return RolloutConfig(
             checkpoint=self.folder,
-            out=self.folder / f"{policy}.h5",
+            out=self.folder / f"{self.model.name}-{policy}.h5",
             data=str(self.data.source),
             policy=policy,
-            adaptive=ADAPTIVE,
+            adaptive=rule,
+            radius=radius,
             k=max(1, round(self.data.described["valid_degree"])),
             steps=profile.horizon,
             trajectories=profile.trajectories,
@@ -263,13 +360,25 @@ class Run:
         """Make what is missing of it."""
         if self.done:
             return
-        self.train(console)
+        if self.model.weights is None:
+            self.train(console)
+        else:
+            self.require_training()
+            self.data.choose_rule(console)
         for policy in self.model.policies:
             if self.metrics(policy).exists():
                 continue
-            snapshot = policy == "adaptive" and self.seed == self.study.profile.seeds[0]
-            content = self.measured(policy, console=console, snapshot=snapshot)
+            drawn = (self.model.name, policy, self.seed) == (*DRAWN, self.study.profile.seeds[0])
+            content = self.measured(policy, console=console, snapshot=drawn)
             write_json(self.metrics(policy), content)
+
+    def require_training(self) -> None:
+        """Raise StudyError where what it builds on has not been trained."""
+        if not (self.folder / LAST).exists():
+            raise StudyError(
+                f"{self.name}: needs {self.data.name}/{self.trained.name}-{self.seed}, which is "
+                "missing"
+            )
 
     def train(self, console: Console) -> None:
         """Train to the end, from where it was left."""
@@ -338,29 +447,25 @@ class Run:
 def matched_radius(data: DataSet, seed: int, radius: float) -> float:
     """The radius of the fixed graph that has as many edges as the adaptive one in rollouts of the
     validation split, interpolated in the radius squared between two models' rollouts."""
-    console = Console(quiet=True)
     denser = next((m for m in data.study.profile.models if m.radius == DENSER), None)
     if denser is None:
         raise StudyError("mse-matched: the profile has no model with the denser graph")
-    counts = []
-    sources: list[tuple[Model, PolicyName]] = [
-        (MSE, "fixed"),
-        (denser, "fixed"),
-        (NLL, "adaptive"),
-    ]
-    for model, policy in sources:
-        run = Run(data, model, seed)
-        path = data.metrics / f"{model.name}-{seed}-{policy}-valid.json"
-        if not path.exists():
-            if not (run.folder / LAST).exists():
-                raise StudyError(f"mse-matched: needs {run.name}, which is missing")
-            write_json(path, run.measured(policy, split="valid", console=console))
-        row = read_json(path)["rollouts"][0]
-        counts.append(row["scalars"]["edges_per_step"]["mean"])
-    sparse, dense, adaptive = counts
+    sparse = valid_edges(data, MSE, seed, "fixed")
+    dense = valid_edges(data, denser, seed, "fixed")
+    adaptive = valid_edges(data, NLL, seed, "adaptive")
     share = (adaptive - sparse) / (dense - sparse) if dense != sparse else 0.0
     squared = radius**2 * (1 + min(max(share, 0.0), 1.0) * (DENSER**2 - 1))
     return round(math.sqrt(squared), 6)
+
+
+def valid_edges(data: DataSet, model: Model, seed: int, policy: PolicyName) -> float:
+    """Edges per step of a model's rollouts of the validation split, which are made once."""
+    run = Run(data, model, seed)
+    path = data.metrics / f"{model.name}-{seed}-{policy}-valid.json"
+    if not path.exists():
+        run.require_training()
+        write_json(path, run.measured(policy, split="valid", console=Console(quiet=True)))
+    return float(read_json(path)["rollouts"][0]["scalars"]["edges_per_step"]["mean"])
 
 
 def refuse_difference(path: str, made: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 
 from adaptgns.config import PolicyName
 from adaptgns.reproduce.results import Estimate, Results, Series
-from adaptgns.reproduce.runs import EVERY, DataSet
+from adaptgns.reproduce.runs import EVERY, DataSet, read_json
+from adaptgns.sweep import RESULT
 
 MISSING = "–"
 PAPER_STATISTICS = {
@@ -42,6 +43,9 @@ COMPARISONS: tuple[Comparison, ...] = (
     ("uncertain or random particles expanded", ("nll", "adaptive"), ("nll", "random")),
     ("sigma of the step before or of this one", ("nll", "adaptive"), ("nll", "two-pass")),
     ("adaptive NLL or fixed MSE: the aim", ("nll", "adaptive"), ("mse", "fixed")),
+    ("the chosen rule or fixed MSE: the aim", ("tuned", "adaptive"), ("mse", "fixed")),
+    ("the chosen rule or fixed, same model", ("tuned", "adaptive"), ("nll", "fixed")),
+    ("the chosen rule, uncertain or random", ("tuned", "adaptive"), ("tuned", "random")),
     ("NLL or MSE, fixed graphs", ("nll", "fixed"), ("mse", "fixed")),
     ("k nearest or all within r, NLL", ("nll", "knn"), ("nll", "fixed")),
     ("k nearest or all within r, MSE", ("mse", "knn"), ("mse", "fixed")),
@@ -91,6 +95,7 @@ def tables(results: Results) -> list[Table]:
             _rollouts(results, data),
             _comparisons(results, data),
             _clouds(results, data),
+            _sweep(results, data),
             *([_along(results, data)] if len(_shares(results, data)) > 1 else []),
             *_calibration(results, data),
         ]
@@ -134,8 +139,10 @@ def _statistics(results: Results) -> Table:
 
 def _rollouts(results: Results, data: DataSet) -> Table:
     mark = results.study.last_mark
-    rows = []
+    rows, times = [], data.times
+    where = str((data.metrics / "times.json").relative_to(results.study.out).as_posix())
     for series in results.of(data.name):
+        time = times[f"{series.model.name}, {series.policy}"]
         true = series.curve("edges_within_radius_true").mean()
         predicted = series.curve("edges_within_radius").mean()
         rows.append(
@@ -151,10 +158,10 @@ def _rollouts(results: Results, data: DataSet) -> Table:
                     f"{true:,.0f}",
                     f"{predicted / true:.2f}",
                     _interval(series.estimate(f"clumping@{mark}"), ".2f"),
-                    f"{np.nanmean(series.scalar('graph_ms')):.2f}",
-                    f"{np.nanmean(series.scalar('model_ms')):.2f}",
+                    f"{time['graph_ms']:.2f}",
+                    f"{time['model_ms']:.2f}",
                 ],
-                series.files,
+                [*series.files, where],
             )
         )
     return Table(
@@ -176,7 +183,8 @@ def _rollouts(results: Results, data: DataSet) -> Table:
         "Means over seeds and trajectories, in brackets the 95 % interval of a bootstrap over "
         "both. Edges are directed and without self-edges. The ratio is that of edges within the "
         "data's radius on predicted over true positions: above 1, the predicted particles clump. "
-        "Milliseconds of a step, medians, on a machine that did other work too.",
+        "Milliseconds of a step are medians of all models and policies in turns, on the same true "
+        "positions.",
     )
 
 
@@ -243,6 +251,42 @@ def _clouds(results: Results, data: DataSet) -> Table:
         "Kinetic energy: root of the mean squared error over the steps, relative to that of the "
         "truth. Transport: squared earth mover's distance between predicted and true particles "
         "(length²), which Sinkhorn's algorithm approximates, here exact.",
+    )
+
+
+def _sweep(results: Results, data: DataSet) -> Table:
+    path = data.metrics / "sweep" / RESULT
+    content = read_json(path)
+    file = str(path.relative_to(results.study.out).as_posix())
+    settings, chosen = content["settings"], content["chosen"]
+    rows = [
+        Row(
+            [
+                *(f"{row[name]:g}" for name in ("tau", "factor", "radius")),
+                f"{row['mse']:.2e}",
+                f"{row['edges']:,.0f}",
+                f"{row['clumping']:.2f}",
+                "yes" if row == chosen else "",
+            ],
+            [file],
+        )
+        for row in content["trials"]
+    ]
+    return Table(
+        f"sweep-{data.name}",
+        f"The adaptive rule on validation, {data.name}",
+        (
+            "tau",
+            "factor",
+            "r",
+            f"MSE@{settings['steps']}",
+            "edges a step",
+            f"ratio@{settings['steps']}",
+            "chosen",
+        ),
+        rows,
+        f"One seed. The budget is that of the fixed MSE model there, {settings['edges']:,.0f} "
+        "directed edges a step.",
     )
 
 
