@@ -177,6 +177,7 @@ def network_backward(
     tape: NetworkTape,
     gradients: Sequence[_Floats],
     *,
+    alone: bool = False,
     threads: int | None = None,
 ) -> tuple[_Floats, _Floats, _Floats]:
     """The way back through :func:`network_forward` with the same arguments.
@@ -184,6 +185,7 @@ def network_backward(
     Args:
         tape: what the forward pass kept.
         gradients: those of the heads' outputs, [N, :] each.
+        alone: whether the heads behind the first learn without a word to the rest of the network.
 
     Returns:
         Gradients, flat, of all parameters in order, of the node features, and of the edge

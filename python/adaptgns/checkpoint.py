@@ -56,7 +56,13 @@ class Checkpoint:
 
 def build_simulator(config: TrainConfig, metadata: Metadata) -> Simulator:
     """An untrained simulator for ``config``, on data described by ``metadata``."""
-    return Simulator(config.model, metadata, noise=config.noise, variance=config.loss != "mse")
+    return Simulator(
+        config.model,
+        metadata,
+        noise=config.noise,
+        variance=config.loss != "mse",
+        variance_alone=config.loss == "decoupled" and config.variance_weight == 0,
+    )
 
 
 def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

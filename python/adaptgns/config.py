@@ -20,9 +20,11 @@ HISTORY = INPUT_FRAMES
 
 TYPE_EMBEDDING = 16
 
-Loss = Literal["nll", "beta-nll", "mse"]
+Loss = Literal["nll", "beta-nll", "decoupled", "mse"]
 Preset = Literal["smoke", "laptop", "paper"]
-PolicyName = Literal["fixed", "adaptive", "two-pass", "random", "knn"]
+PolicyName = Literal[
+    "fixed", "adaptive", "two-sided", "two-pass", "random", "acceleration", "divergence", "knn"
+]
 Device = Literal["auto", "cpu", "cuda"]
 EdgeUpdate = Literal["fixed", "legacy"]
 
@@ -73,8 +75,18 @@ class ModelConfig:
     """What each step leaves of the edges' latents: fixed adds the messages; legacy doubles them, as
     geoelements/gns did before its pull request 94 (December 2024)."""
 
+    variance_layers: int = 1
+    """Hidden layers of the variance head."""
+
     def __post_init__(self) -> None:
-        _require(self, latent=COUNT, hidden_layers=COUNT, steps=COUNT, radius=POSITIVE)
+        _require(
+            self,
+            latent=COUNT,
+            hidden_layers=COUNT,
+            steps=COUNT,
+            radius=POSITIVE,
+            variance_layers=COUNT,
+        )
 
     def radius_or(self, default: float) -> float:
         """The radius, or the data set's."""
@@ -89,9 +101,13 @@ class AdaptiveConfig:
     """Percentile of sigma above which a particle sees farther."""
     factor: float = 1.267
     """How many times farther."""
+    low_tau: float = 30.0
+    """Two-sided alone: percentile below which a particle sees less far."""
+    low_factor: float = 0.8
+    """Two-sided alone: how many times as far."""
 
     def __post_init__(self) -> None:
-        _require(self, tau=PERCENTILE, factor=FACTOR)
+        _require(self, tau=PERCENTILE, factor=FACTOR, low_tau=PERCENTILE, low_factor=SHARE)
 
 
 @dataclass(frozen=True)
@@ -107,8 +123,9 @@ class RolloutConfig:
     split: Literal["train", "valid", "test"] = "test"
     """Which part of the data."""
     policy: PolicyName = "fixed"
-    """Graph of each step: fixed radius, adaptive (sigma of the step before), two-pass (sigma of
-    this step), random (the same share of particles), knn."""
+    """Graph of each step: fixed radius; adaptive (sigma of the step before), two-sided (and shorter
+    edges where it is low), two-pass (sigma of this step); the same share of particles chosen at
+    random, by the acceleration before, or by the divergence of the velocities around; knn."""
     adaptive: AdaptiveConfig = field(default_factory=AdaptiveConfig)
     k: int = 6
     """Neighbours of the policy knn."""
@@ -154,9 +171,16 @@ class TrainConfig:
     adaptive: AdaptiveConfig = field(default_factory=AdaptiveConfig)
     loss: Loss = "nll"
     """nll trains a variance beside the acceleration; beta-nll does and weighs hard particles more;
-    mse trains the acceleration alone."""
-    graph: Literal["base", "adaptive"] = "base"
-    """Graph seen in training; adaptive has the one-step lag of the rollout."""
+    decoupled trains the acceleration as mse does, and the variance on the errors that leaves; mse
+    trains the acceleration alone."""
+    variance_weight: float = 0.0
+    """Of the loss decoupled: weight of the variance's likelihood, through which it shapes the
+    latents, too; 0: the variance head learns alone."""
+    variance_ahead: bool = False
+    """Of the loss decoupled: the variance stands for the error one frame later, on the graph that
+    it chooses; needs unroll >= 2."""
+    graph: Literal["base", "adaptive", "two-sided"] = "base"
+    """Graph seen in training; all but base have the one-step lag of the rollout."""
     steps: int = 20_000
     """Optimizer steps."""
     batch: int = 2
@@ -227,6 +251,7 @@ class TrainConfig:
             velocity_correction=SHARE,
             position_correction=SHARE,
             compression=SHARE,
+            variance_weight=NOT_NEGATIVE,
             unroll=COUNT,
             seed=NOT_NEGATIVE,
             workers=NOT_NEGATIVE,
@@ -238,6 +263,11 @@ class TrainConfig:
             test_trajectories=COUNT,
             test_horizon=COUNT,
         )
+        if self.variance_ahead and (self.loss != "decoupled" or self.unroll < 2):
+            raise ValueError(
+                f"variance_ahead: needs the loss decoupled and unroll >= 2; got {self.loss} and "
+                f"{self.unroll}"
+            )
 
 
 T = TypeVar("T")

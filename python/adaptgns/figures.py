@@ -31,8 +31,26 @@ STYLE = {
     "legend.frameon": False,
     "pdf.fonttype": 42,  # text stays text
 }
-DASHES = {"fixed": "-", "adaptive": "--", "two-pass": "-.", "random": ":", "knn": (0, (1, 3))}
-MARKERS = {"fixed": "o", "adaptive": "s", "two-pass": "^", "random": "x", "knn": "D"}
+DASHES = {
+    "fixed": "-",
+    "adaptive": "--",
+    "two-sided": (0, (6, 1, 1, 1)),
+    "two-pass": "-.",
+    "random": ":",
+    "acceleration": (0, (3, 1)),
+    "divergence": (0, (8, 2)),
+    "knn": (0, (1, 3)),
+}
+MARKERS = {
+    "fixed": "o",
+    "adaptive": "s",
+    "two-sided": "P",
+    "two-pass": "^",
+    "random": "x",
+    "acceleration": "v",
+    "divergence": "<",
+    "knn": "D",
+}
 BASELINE = "#9aa3ad"
 TRAINING = {
     "loss": "training loss",

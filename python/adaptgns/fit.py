@@ -7,6 +7,7 @@ import math
 import time
 from contextlib import nullcontext
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -36,8 +37,9 @@ from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
 from adaptgns.graph import adaptive_graph, radius_graph
 from adaptgns.interruption import interruption
-from adaptgns.losses import training_loss
+from adaptgns.losses import training_loss, variance_loss
 from adaptgns.network import Prediction
+from adaptgns.policies import two_sided
 from adaptgns.processes import ALONE, Processes
 from adaptgns.rollout import to_sigma
 from adaptgns.segment import Graph
@@ -74,9 +76,9 @@ class Trainer:
         checkpoint: Checkpoint | None = None,
         processes: Processes = ALONE,
     ) -> None:
-        if config.graph == "adaptive" and (config.loss == "mse" or not config.model.edges):
+        if config.graph != "base" and (config.loss == "mse" or not config.model.edges):
             raise ValueError(
-                "graph: adaptive needs a model with edges and a variance; got the loss "
+                f"graph: {config.graph} needs a model with edges and a variance; got the loss "
                 f"{config.loss} and model.edges {config.model.edges}"
             )
         if config.batch < processes.count:
@@ -239,22 +241,39 @@ class Trainer:
 
     def _loss(self, batch: Batch) -> Tensor:
         """The mean loss of ``batch`` over particles and frames."""
-        window, graph, variance = batch.window, self._first_graph(batch), None
-        unrolled = batch.following if 2 * self.step >= self.config.steps else batch.following[:, :1]
+        config, mobile = self.config, batch.mobile
+        window, graph = batch.window, self._first_graph(batch)
+        unrolled = config.unroll if 2 * self.step >= config.steps else 1
+        # The error one frame later is needed for a variance that stands for it.
+        frames = max(unrolled, 2) if config.variance_ahead else unrolled
         losses: list[Tensor] = []
-        for following in unrolled.unbind(1):
-            prediction = self.simulator(window, batch.particle_type, graph, batch.material)
+        variance = likelihood = None
+        for number, following in enumerate(batch.following[:, :frames].unbind(1)):
+            with torch.set_grad_enabled(number < unrolled):
+                prediction = self.simulator(window, batch.particle_type, graph, batch.material)
             target = self.simulator.target(window, following)
-            losses.append(
-                training_loss(self.config.loss, prediction, target, batch.mobile, variance=variance)
-            )
-            if len(losses) < unrolled.shape[1]:
+            if number < unrolled:
+                loss = training_loss(
+                    "mse" if config.variance_ahead else config.loss,
+                    prediction,
+                    target,
+                    mobile,
+                    variance=variance,
+                    variance_weight=config.variance_weight or 1.0,
+                )
+                losses.append(loss)
+            if config.variance_ahead and number == 1:
+                assert variance is not None, "the first frame's"
+                error = (prediction.acceleration - target).square().sum(1)[mobile]
+                likelihood = variance_loss(variance[mobile], error, target.shape[1])
+            if number + 1 < frames:
                 variance = prediction.variance if variance is None else variance
                 position = self.simulator.advance(window, prediction.acceleration)
-                position = torch.where(batch.mobile[:, None], position, following)
+                position = torch.where(mobile[:, None], position, following)
                 window = torch.cat([window[:, 1:], position[:, None]], dim=1)
                 graph = self._graph(batch, window, prediction)
-        return torch.stack(losses).mean()
+        loss = torch.stack(losses).mean()
+        return loss if likelihood is None else loss + (config.variance_weight or 1.0) * likelihood
 
     def learning_rate(self) -> float:
         """The learning rate of the current step."""
@@ -289,19 +308,26 @@ class Trainer:
         if not np.isfinite(positions).all():
             raise self._diverged("the predicted positions became infinite or NaN")
         build = partial(radius_graph, positions, self.simulator.radius)
-        if self.config.graph == "adaptive":
+        if self.config.graph != "base":
             sigma = to_sigma(earlier)
             if not np.isfinite(sigma).all():
                 raise self._diverged("the predicted variance became infinite or NaN")
-            build = partial(
-                adaptive_graph,
-                positions,
-                sigma,
-                self.simulator.radius,
-                self.config.adaptive.tau,
-                self.config.adaptive.factor,
-                eligible=batch.mobile.cpu().numpy(),
-            )
+            mobile, rule = batch.mobile.cpu().numpy(), self.config.adaptive
+            if self.config.graph == "adaptive":
+                build = partial(
+                    adaptive_graph,
+                    positions,
+                    sigma,
+                    self.simulator.radius,
+                    rule.tau,
+                    rule.factor,
+                    eligible=mobile,
+                )
+            else:
+                graphs = [slice(*ends) for ends in pairwise(batch.ptr.tolist())]
+                factors = [two_sided(sigma[own], rule, mobile[own]) for own in graphs]
+                radii = self.simulator.radius * np.concatenate(factors)
+                build = partial(radius_graph, positions, radii)
         edges = build(
             ptr=batch.ptr.cpu().numpy(),
             box=self.metadata.box,

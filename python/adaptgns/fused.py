@@ -51,15 +51,23 @@ def network(
     graph: Graph | None,
     *,
     heads: int,
+    alone: bool = False,
 ) -> list[Tensor]:
     """Outputs ``[N, :]`` of the last ``heads`` of the ``perceptrons``: node encoder, edge encoder,
-    each step's edge and node perceptron, heads; without ``graph`` no edge perceptrons."""
+    each step's edge and node perceptron, heads; without ``graph`` no edge perceptrons. With
+    ``alone`` the heads behind the first send no gradients to the rest of the network."""
     parameters = [list(perceptron.parameters()) for perceptron in perceptrons]
     sizes = [len(own) for own in parameters]
     flat = [parameter for own in parameters for parameter in own]
-    out: tuple[Tensor, ...] = _Network.apply(
-        graph, sizes, heads, node_features, edge_features, *flat
-    )
+    index: list[Tensor] = []
+    if graph is not None and edge_features is not None:
+        index = [graph.senders, graph.receivers, graph.receiver_offsets]
+        if graph.by_sender is not None and graph.sender_offsets is not None:
+            index += [graph.by_sender, graph.sender_offsets]
+    inputs = [node_features, edge_features, *index, *flat]
+    # Not what `forward` can see, where no gradients are taken and parameters ask for them anyway.
+    keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
+    out: tuple[Tensor, ...] = _Network.apply(len(index), sizes, heads, alone, keep, *inputs)
     return list(out)
 
 
@@ -67,13 +75,8 @@ def _array(tensor: Tensor) -> Any:
     return tensor.detach().contiguous().numpy()
 
 
-def _edges(graph: Graph | None, features: Tensor | None) -> Any:
-    if graph is None or features is None:
-        return None
-    index = [graph.senders, graph.receivers, graph.receiver_offsets]
-    if graph.by_sender is not None and graph.sender_offsets is not None:
-        index += [graph.by_sender, graph.sender_offsets]
-    return _array(features), [_array(part) for part in index]
+def _edges(index: Sequence[Tensor], features: Tensor | None) -> Any:
+    return None if features is None else (_array(features), [_array(part) for part in index])
 
 
 def _perceptrons(sizes: list[int], parameters: Sequence[Tensor]) -> Any:
@@ -85,35 +88,40 @@ class _Network(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        graph: Graph | None,
+        indices: int,
         sizes: list[int],
         heads: int,
+        alone: bool,
+        keep: bool,
         node_features: Tensor,
         edge_features: Tensor | None,
-        *parameters: Tensor,
+        *rest: Tensor,
     ) -> tuple[Tensor, ...]:
+        index, parameters = rest[:indices], rest[indices:]
         outputs, tape = network_forward(
             _perceptrons(sizes, parameters),
             _array(node_features),
-            _edges(graph, edge_features),
+            _edges(index, edge_features),
             heads=heads,
-            keep=any(ctx.needs_input_grad),
+            keep=keep,
             threads=_thread_count(),
         )
-        ctx.graph, ctx.sizes, ctx.tape = graph, sizes, tape
-        ctx.save_for_backward(node_features, edge_features, *parameters)
+        ctx.indices, ctx.sizes, ctx.alone, ctx.tape = indices, sizes, alone, tape
+        ctx.save_for_backward(node_features, edge_features, *rest)
         return tuple(torch.from_numpy(output) for output in outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
-        node_features, edge_features, *parameters = ctx.saved_tensors
+        node_features, edge_features, *rest = ctx.saved_tensors
+        index, parameters = rest[: ctx.indices], rest[ctx.indices :]
         of_parameters, of_nodes, of_edges = network_backward(
             _perceptrons(ctx.sizes, parameters),
             _array(node_features),
-            _edges(ctx.graph, edge_features),
+            _edges(index, edge_features),
             ctx.tape,
             [_array(gradient) for gradient in gradients],
+            alone=ctx.alone,
             threads=_thread_count(),
         )
         parts = torch.split(torch.from_numpy(of_parameters), [p.numel() for p in parameters])
@@ -121,10 +129,9 @@ class _Network(torch.autograd.Function):
         if edge_features is not None:
             to_edges = torch.from_numpy(of_edges).view_as(edge_features)
         return (
-            None,
-            None,
-            None,
+            *(None,) * 5,
             torch.from_numpy(of_nodes).view_as(node_features),
             to_edges,
+            *(None,) * ctx.indices,
             *(part.view_as(p) for part, p in zip(parts, parameters, strict=True)),
         )

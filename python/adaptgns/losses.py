@@ -17,6 +17,7 @@ def training_loss(
     mobile: Tensor,
     *,
     variance: Tensor | None = None,
+    variance_weight: float = 1.0,
 ) -> Tensor:
     """The loss ``kind`` of normalized ``target`` accelerations ``[N, d]``; a scalar.
 
@@ -38,6 +39,12 @@ def training_loss(
         return squared_error.mean() / dim
     if prediction.variance is None:
         raise ValueError(f"loss: {kind} needs a network with a variance head; this one has none")
+    if kind == "decoupled":
+        loss = squared_error.mean() / dim
+        if variance is None:
+            likelihood = variance_loss(prediction.variance[mobile], squared_error, dim)
+            loss = loss + variance_weight * likelihood
+        return loss
     weight = (prediction.variance if variance is None else variance.detach())[mobile]
     likelihood = squared_error / (2 * weight)
     if variance is None:
@@ -45,3 +52,9 @@ def training_loss(
     if kind == "beta-nll":
         likelihood = likelihood * weight.detach() ** BETA
     return likelihood.mean()
+
+
+def variance_loss(variance: Tensor, squared_error: Tensor, dim: int) -> Tensor:
+    """Mean over M particles of e / (2 s^2) + (dim/2) log s^2 for their ``variance`` s^2 ``[M]`` and
+    ``squared_error`` e ``[M]``, which is summed over ``dim`` dimensions and learns nothing."""
+    return (squared_error.detach() / (2 * variance) + dim / 2 * variance.log()).mean()

@@ -71,7 +71,8 @@ class EncodeProcessDecode(nn.Module):
     """Node and edge features to normalized accelerations and their variance.
 
     Without ``edges`` it is the per-particle baseline: the same encoder, node updates, decoder and
-    variance head, and no message ever arrives.
+    variance head, and no message ever arrives. With ``variance_alone`` what the variance head
+    learns changes nothing else.
     """
 
     def __init__(
@@ -85,10 +86,13 @@ class EncodeProcessDecode(nn.Module):
         steps: int,
         edges: bool,
         variance: bool,
+        variance_layers: int = 1,
+        variance_alone: bool = False,
         legacy_edges: bool = False,
     ) -> None:
         super().__init__()
         self.legacy_edges = legacy_edges
+        self.variance_alone = variance_alone
         self.node_encoder = mlp(node_features, latent, hidden_layers, latent, norm=True)
         self.edge_encoder = (
             mlp(edge_features, latent, hidden_layers, latent, norm=True) if edges else None
@@ -100,7 +104,9 @@ class EncodeProcessDecode(nn.Module):
             for _ in range(steps)
         )
         self.decoder = mlp(latent, latent, hidden_layers, outputs, norm=False)
-        self.variance_head = mlp(latent, latent, 1, 1, norm=False) if variance else None
+        self.variance_head = (
+            mlp(latent, latent, variance_layers, 1, norm=False) if variance else None
+        )
 
     def forward(
         self, node_features: Tensor, edge_features: Tensor | None, graph: Graph | None
@@ -108,11 +114,18 @@ class EncodeProcessDecode(nn.Module):
         """Predictions for ``node_features`` ``[N, :]`` and ``edge_features`` ``[E, :]``."""
         if fused.applies(node_features) and not self.legacy_edges:
             acceleration, *variances = fused.network(
-                self._perceptrons(), node_features, edge_features, graph, heads=len(self._heads())
+                self._perceptrons(),
+                node_features,
+                edge_features,
+                graph,
+                heads=len(self._heads()),
+                alone=self.variance_alone,
             )
         else:
             nodes = self._encode_and_process(node_features, edge_features, graph)
-            acceleration, *variances = (head(nodes) for head in self._heads())
+            others = nodes.detach() if self.variance_alone else nodes
+            acceleration = self.decoder(nodes)
+            variances = [head(others) for head in self._heads()[1:]]
         variance = None
         if variances:
             variance = functional.softplus(variances[0]).squeeze(1) + VARIANCE_FLOOR

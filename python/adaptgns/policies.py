@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from adaptgns.config import AdaptiveConfig, PolicyName
 from adaptgns.graph import adaptive_graph, knn_graph, radius_graph
+from adaptgns.periodic import minimum_image
 
 Edges = tuple[NDArray[np.int64], NDArray[np.int64]]
 """``[2, E]`` senders and receivers, and the receivers' row offsets ``[N + 1]``"""
@@ -24,8 +25,8 @@ Edges = tuple[NDArray[np.int64], NDArray[np.int64]]
 class State:
     """What a policy may look at before a step."""
 
-    positions: NDArray[np.float32]
-    """``[N, d]``"""
+    history: NDArray[np.float32]
+    """``[N, H, d]`` positions, the current ones last"""
     sigma: NDArray[np.float32] | None
     """``[N]``, predicted one step ago; None before the first step"""
     mobile: NDArray[np.bool_]
@@ -38,11 +39,16 @@ class State:
     predict_sigma: Callable[[Edges], NDArray[np.float32]]
     """A forward pass of the model on given edges, for its sigma ``[N]`` alone"""
 
-    def base(self) -> Edges:
-        """The radius graph."""
+    @property
+    def positions(self) -> NDArray[np.float32]:
+        """``[N, d]``, the current ones"""
+        return np.ascontiguousarray(self.history[:, -1])
+
+    def base(self, radius: float | NDArray[np.float64] | None = None) -> Edges:
+        """The radius graph, of the base radius or another, or of one ``[N]`` for each particle."""
         return radius_graph(
             self.positions,
-            self.radius,
+            self.radius if radius is None else radius,
             box=self.box,
             self_edges=self.self_edges,
             return_offsets=True,
@@ -98,6 +104,58 @@ class Adaptive:
 
 
 @dataclass(frozen=True)
+class TwoSided:
+    """As :class:`Adaptive`, and the particles least uncertain see less far: an edge is as long as
+    the farther-seeing end allows."""
+
+    name: ClassVar[PolicyName] = "two-sided"
+    needs_sigma: ClassVar[bool] = True
+    rule: AdaptiveConfig
+
+    def edges(self, state: State) -> Edges:
+        if state.sigma is None:
+            return state.base()
+        return state.base(state.radius * two_sided(state.sigma, self.rule, state.mobile))
+
+
+@dataclass(frozen=True)
+class Acceleration:
+    """The particles that were accelerated most see farther, whatever the model says."""
+
+    name: ClassVar[PolicyName] = "acceleration"
+    needs_sigma: ClassVar[bool] = False
+    rule: AdaptiveConfig
+
+    def edges(self, state: State) -> Edges:
+        velocity = minimum_image(np.diff(state.history[:, -3:], axis=1), state.box)
+        change = np.linalg.norm(np.diff(velocity, axis=1)[:, 0], axis=1)
+        return state.expanded(change.astype(np.float32), self.rule)
+
+
+@dataclass(frozen=True)
+class Divergence:
+    """The particles whose neighbours close in or part fastest see farther, whatever the model says.
+
+    The divergence of the velocity at particle i is estimated from its n neighbours j within the
+    base radius as |(d / n) Σ_j (v_j - v_i)·(x_j - x_i) / |x_j - x_i|²|, 0 without any."""
+
+    name: ClassVar[PolicyName] = "divergence"
+    needs_sigma: ClassVar[bool] = False
+    rule: AdaptiveConfig
+
+    def edges(self, state: State) -> Edges:
+        positions, (particles, dim) = state.positions, state.positions.shape
+        senders, receivers = radius_graph(positions, state.radius, box=state.box)
+        velocity = minimum_image(positions - state.history[:, -2], state.box)
+        apart = minimum_image(positions[senders] - positions[receivers], state.box)
+        distance = np.maximum(np.square(apart).sum(1), np.finfo(np.float32).tiny)
+        rate = ((velocity[senders] - velocity[receivers]) * apart).sum(1) / distance
+        total = np.bincount(receivers, rate, particles)
+        degree = np.maximum(np.bincount(receivers, minlength=particles), 1)
+        return state.expanded(np.abs(dim * total / degree).astype(np.float32), self.rule)
+
+
+@dataclass(frozen=True)
 class TwoPass:
     """The particles most uncertain now see farther, at the price of a second forward pass: what
     the lag of :class:`Adaptive` costs in accuracy."""
@@ -143,16 +201,29 @@ class NearestNeighbours:
         )
 
 
+def two_sided(
+    sigma: NDArray[np.float32], rule: AdaptiveConfig, eligible: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """``[N]`` how many times the base radius each particle of one graph sees, by its ``sigma``
+    ``[N]``; 1 for those that are not ``eligible`` ``[N]``, whom the percentiles do not count."""
+    factors = np.ones(len(sigma))
+    if eligible.any():
+        low, high = np.percentile(sigma[eligible], (rule.low_tau, rule.tau))
+        factors[eligible & (sigma < low)] = rule.low_factor
+        factors[eligible & (sigma > high)] = rule.factor
+    return factors
+
+
 def make_policy(name: PolicyName, rule: AdaptiveConfig, *, k: int, seed: int) -> Policy:
     """The policy called ``name``; ``seed`` matters for ``random`` alone, ``k`` for ``knn``."""
+    ruled = (Adaptive, TwoSided, TwoPass, Acceleration, Divergence)
+    for policy in ruled:
+        if policy.name == name:
+            return policy(rule)
     match name:
-        case "fixed":
-            return Fixed()
-        case "adaptive":
-            return Adaptive(rule)
-        case "two-pass":
-            return TwoPass(rule)
         case "random":
             return Random(rule, np.random.default_rng(seed))
         case "knn":
             return NearestNeighbours(k)
+        case _:
+            return Fixed()

@@ -112,7 +112,7 @@ def steps(
         edges = graph = None
         if simulator.config.edges:
             state = State(
-                positions=window[:, -1].cpu().numpy(),
+                history=window.cpu().numpy(),
                 sigma=sigma,
                 mobile=mobile,
                 radius=simulator.radius if radius is None else radius,

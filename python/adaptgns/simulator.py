@@ -30,7 +30,13 @@ class Simulator(nn.Module):
     """
 
     def __init__(
-        self, config: ModelConfig, metadata: Metadata, *, noise: float, variance: bool
+        self,
+        config: ModelConfig,
+        metadata: Metadata,
+        *,
+        noise: float,
+        variance: bool,
+        variance_alone: bool = False,
     ) -> None:
         super().__init__()
         self.config = config
@@ -51,6 +57,8 @@ class Simulator(nn.Module):
             steps=config.steps,
             edges=config.edges,
             variance=variance,
+            variance_layers=config.variance_layers,
+            variance_alone=variance_alone,
             legacy_edges=config.edge_update == "legacy",
         )
 

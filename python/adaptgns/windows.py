@@ -101,7 +101,7 @@ class Windows(Dataset[Sample]):
         self.config = config
         self.noise = noise
         self.radius = config.model.radius_or(metadata.radius)
-        self.frames = HISTORY + config.unroll + (config.graph == "adaptive")
+        self.frames = HISTORY + config.unroll + (config.graph != "base")
         counts = np.maximum(trajectories.lengths - self.frames + 1, 0)
         self.starts = np.concatenate([[0], np.cumsum(counts)])
         self.particles = np.repeat(trajectories.particle_counts, counts)

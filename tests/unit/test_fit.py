@@ -16,7 +16,7 @@ import torch
 from rich.console import Console
 
 from adaptgns import fit
-from adaptgns.checkpoint import BEST, LAST, read_checkpoint
+from adaptgns.checkpoint import BEST, LAST, build_simulator, read_checkpoint
 from adaptgns.config import AdaptiveConfig, TrainConfig
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
@@ -47,7 +47,7 @@ def log(folder: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("graph", ["base", "adaptive"])
+@pytest.mark.parametrize("graph", ["base", "adaptive", "two-sided"])
 def test_one_batch_can_be_overfitted(
     drops: Path, tmp_path: Path, small_config: TrainConfig, graph: str
 ) -> None:
@@ -286,3 +286,68 @@ def test_unrolled_windows_are_those_of_a_rollout(
     ):
         torch.testing.assert_close(position.detach(), where, rtol=0, atol=1e-6)
         assert torch.equal(graph_.senders, senders)
+
+
+def test_a_decoupled_variance_teaches_the_rest_nothing_unless_asked(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    """The accelerations' weights after some steps are those of the loss mse, to rounding."""
+
+    def trained(**changes: object) -> dict[str, torch.Tensor]:
+        run = trainer(drops, tmp_path, replace(small_config, **changes))
+        batch = run.windows.collate([run.windows[0, 10], run.windows[0, 40]])
+        # As the variance head draws its weights last, those before it are the same.
+        for run.step in range(5):
+            run.train_step(batch)
+        return run.simulator.state_dict()
+
+    alone, mse = trained(loss="decoupled"), trained(loss="mse")
+    together = trained(loss="decoupled", variance_weight=0.5)
+    for name, value in mse.items():
+        torch.testing.assert_close(alone[name], value, rtol=1e-4, atol=1e-6)
+    heads = [name for name in alone if name not in mse]
+    assert heads
+    assert all("variance_head" in name for name in heads)
+    fresh = build_simulator(replace(small_config, loss="decoupled"), read_metadata(drops))
+    assert any(not torch.equal(alone[name], fresh.state_dict()[name]) for name in heads)
+    assert any((together[name] - mse[name]).abs().max() > 1e-4 for name in mse)
+
+
+@pytest.mark.parametrize("step", [0, 8])
+def test_a_variance_ahead_learns_the_error_of_the_next_frame(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, step: int
+) -> None:
+    config = replace(
+        small_config,
+        loss="decoupled",
+        variance_ahead=True,
+        unroll=2,
+        variance_weight=0.3,
+        noise=0.0,
+    )
+    run = trainer(drops, tmp_path, config)
+    run.step = step  # of 12: one frame in the first half, two in the second
+    batch = run.windows.collate([run.windows[0, 10]])
+    loss = run._loss(batch)
+    window, losses, variances = batch.window, [], []
+    with torch.no_grad():
+        for following in batch.following.unbind(1):
+            graph = graph_of(window[:, -1].numpy(), run.simulator.radius)
+            out = run.simulator(window, batch.particle_type, graph, batch.material)
+            error = (out.acceleration - run.simulator.target(window, following)).square().sum(1)
+            losses.append(error.mean() / 2)
+            variances.append(out.variance)
+            after = run.simulator.advance(window, out.acceleration)
+            window = torch.cat([window[:, 1:], after[:, None]], dim=1)
+    likelihood = (error / (2 * variances[0]) + variances[0].log()).mean()
+    counted = losses[:1] if step == 0 else losses
+    torch.testing.assert_close(
+        loss.detach(), torch.stack(counted).mean() + 0.3 * likelihood, rtol=1e-4, atol=1e-6
+    )
+
+
+def test_a_variance_ahead_needs_a_frame_ahead() -> None:
+    with pytest.raises(ValueError, match=r"variance_ahead: needs the loss decoupled and unroll"):
+        TrainConfig(loss="decoupled", variance_ahead=True, unroll=1)
+    with pytest.raises(ValueError, match="got nll and 3"):
+        TrainConfig(loss="nll", variance_ahead=True, unroll=3)

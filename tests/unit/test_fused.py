@@ -135,6 +135,52 @@ def test_inference_equals_training_and_needs_no_edges_by_sender() -> None:
     assert torch.equal(seen.variance, trained[1])
 
 
+def test_a_tape_is_kept_for_gradients_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = []
+
+    def spy(*arguments: object, keep: bool, **others: object) -> object:
+        kept.append(keep)
+        return network_forward(*arguments, keep=keep, **others)
+
+    monkeypatch.setattr(fused, "network_forward", spy)
+    made = Case()
+    for context in (torch.enable_grad(), torch.no_grad(), torch.inference_mode()):
+        with context:
+            made.network(made.node_features, made.edge_features, made.graph)
+    made.network.requires_grad_(False)
+    made.network(made.node_features, made.edge_features, made.graph)
+    assert kept == [True, False, False, False]
+
+
+def test_a_graph_changed_before_the_way_back_is_told() -> None:
+    made = Case()
+    assert made.graph is not None
+    out = made.network(made.node_features, made.edge_features, made.graph).acceleration.sum()
+    made.graph.senders[0] += 1
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        out.backward()
+
+
+@pytest.mark.parametrize("with_edges", [True, False])
+def test_a_variance_alone_teaches_the_rest_nothing(with_edges: bool) -> None:
+    made = Case(with_edges=with_edges)
+    taught = []
+    for dtype in (torch.float32, torch.float64):
+        made.network.to(dtype).zero_grad()
+        made.network.variance_alone = True
+        given = [
+            None if f is None else f.to(dtype) for f in (made.node_features, made.edge_features)
+        ]
+        made.network(*given, made.graph).variance.sum().backward()
+        taught.append({name: p.grad for name, p in made.network.named_parameters()})
+    for name, gradient in taught[0].items():
+        if name.startswith("variance_head"):
+            assert gradient.any()
+            torch.testing.assert_close(gradient.double(), taught[1][name], rtol=1e-4, atol=1e-6)
+        else:
+            assert gradient is None or not gradient.any()
+
+
 def test_gradients_can_be_taken_twice_of_one_pass() -> None:
     made = Case()
     out = made.network(made.node_features, made.edge_features, made.graph).acceleration.sum()
@@ -185,6 +231,22 @@ EDGES = (np.zeros((1, 2), np.float32), INDEX)
         ({"node_features": np.zeros((2, 3))}, TypeError, "node_features: .* float32"),
         ({"node_features": np.zeros(5, np.float32)}, ValueError, "node_features: .* rows of 3"),
         ({"edges": (np.zeros((2, 2), np.float32), INDEX)}, ValueError, "edge_features: .* 1 edges"),
+        (
+            {"node_features": np.zeros((1, 6), np.float32)},
+            ValueError,
+            "node_features: .* rows of 3",
+        ),
+        ({"edges": (np.zeros((2, 1), np.float32), INDEX)}, ValueError, "edge_features: .*of 2"),
+        (
+            {"perceptrons": [[np.zeros((3, 4), np.float32), np.zeros(4, np.float32)], *GOOD[1:]]},
+            ValueError,
+            r"got a weight of shape \[3, 4\] for 4 biases",
+        ),
+        (
+            {"perceptrons": [*GOOD[:4], [np.zeros((4, 2), np.float32), np.zeros(2, np.float32)]]},
+            ValueError,
+            r"got a weight of shape \[4, 2\] for 2 biases",
+        ),
         ({"edges": None}, ValueError, "perceptrons"),
         ({"edges": (EDGES[0], INDEX[:2])}, TypeError, "edges: got 2 arrays, must be 3"),
         ({"edges": (EDGES[0], [np.array([2]), *INDEX[1:]])}, ValueError, "senders: must be nodes"),
@@ -227,3 +289,6 @@ def test_a_tape_goes_with_its_own_pass() -> None:
             tape,
             [ones],
         )
+    deeper = [*GOOD[:4], [*linear(4, 4), *linear(2, 4)]]
+    with pytest.raises(ValueError, match="tape: comes from another network"):
+        network_backward(deeper, NODES, backward, tape, [ones])

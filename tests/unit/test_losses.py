@@ -69,3 +69,25 @@ def test_nll_without_variance_head_is_refused(case) -> None:
     prediction, target, mobile = case
     with pytest.raises(ValueError, match="nll needs a network with a variance head"):
         training_loss("nll", Prediction(prediction.acceleration, None), target, mobile)
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.1])
+def test_decoupled_is_mse_and_the_likelihood_of_errors_that_learn_nothing(
+    case, weight: float
+) -> None:
+    prediction, target, mobile = case
+    acceleration = prediction.acceleration.clone().requires_grad_()
+    variance = prediction.variance.clone().requires_grad_()
+    own = Prediction(acceleration, variance)
+    loss = training_loss("decoupled", own, target, mobile, variance_weight=weight)
+    mse = training_loss("mse", prediction, target, mobile)
+    nll = training_loss("nll", prediction, target, mobile)
+    torch.testing.assert_close(loss, mse + weight * nll)
+    loss.backward()
+    (by_mse,) = torch.autograd.grad(training_loss("mse", own, target, mobile), acceleration)
+    torch.testing.assert_close(acceleration.grad, by_mse)
+    (by_nll,) = torch.autograd.grad(training_loss("nll", own, target, mobile), variance)
+    torch.testing.assert_close(variance.grad, weight * by_nll)
+    # In an unrolled frame the variance is left alone.
+    later = training_loss("decoupled", own, target, mobile, variance=prediction.variance)
+    torch.testing.assert_close(later, mse)

@@ -27,7 +27,7 @@ from adaptgns.config import (
 )
 from adaptgns.data.metadata import Metadata, read_metadata
 from adaptgns.data.trajectories import Trajectory, open_split
-from adaptgns.policies import Adaptive, Fixed, make_policy
+from adaptgns.policies import Adaptive, Edges, Fixed, State, make_policy
 from adaptgns.rollout import main, steps, write_rollouts
 from adaptgns.simulator import Simulator
 
@@ -97,7 +97,75 @@ def test_knn_has_k_senders_each(simulator: Simulator, trajectory: Trajectory) ->
     assert step.edges == 4 * len(trajectory.particle_type)
 
 
-@pytest.mark.parametrize("name", ["adaptive", "two-pass", "random"])
+def brute_force(positions: np.ndarray, radii: np.ndarray) -> set[tuple[int, int]]:
+    """Pairs no farther apart than the larger of their ends' radii."""
+    distance = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    near = distance <= np.maximum(radii[:, None], radii[None])
+    np.fill_diagonal(near, False)
+    return set(zip(*map(list, np.nonzero(near)), strict=True))
+
+
+def state_of(rng: np.random.Generator, **changes: object) -> State:
+    start = rng.uniform(0.3, 0.4, (60, 1, 2))
+    history = (start + rng.normal(0, 1e-3, (60, 6, 2)).cumsum(1)).astype(np.float32)
+    given: dict = {
+        "history": history,
+        "sigma": rng.random(60).astype(np.float32),
+        "mobile": np.arange(60) >= 10,
+        "radius": 0.015,
+        "self_edges": False,
+        "box": None,
+        "predict_sigma": None,
+    }
+    return State(**given | changes)
+
+
+def pairs(edges: Edges) -> set[tuple[int, int]]:
+    return set(zip(*edges[0].tolist(), strict=True))
+
+
+def test_two_sided_cuts_where_it_is_sure_and_adds_where_it_is_not() -> None:
+    state = state_of(np.random.default_rng(0))
+    rule = AdaptiveConfig(tau=70, factor=1.5, low_tau=40, low_factor=0.6)
+    assert state.sigma is not None
+    low, high = np.percentile(state.sigma[10:], (40, 70))
+    radii = np.full(60, 0.015)
+    radii[10:][state.sigma[10:] < low] *= 0.6
+    radii[10:][state.sigma[10:] > high] *= 1.5
+    policy = make_policy("two-sided", rule, k=0, seed=0)
+    found, base = pairs(policy.edges(state)), pairs(state.base())
+    assert found == brute_force(state.positions, radii)
+    assert found - base
+    assert base - found
+    assert pairs(policy.edges(replace(state, sigma=None))) == base
+    one_sided = make_policy("adaptive", rule, k=0, seed=0)
+    never_low = make_policy("two-sided", replace(rule, low_tau=0.0), k=0, seed=0)
+    assert pairs(never_low.edges(state)) == pairs(one_sided.edges(state))
+
+
+@pytest.mark.parametrize("name", ["acceleration", "divergence"])
+def test_physical_priors_expand_what_moves_most(name: PolicyName) -> None:
+    """Particles that alone are accelerated, or fly apart, see farther; a common motion is none."""
+    rng = np.random.default_rng(1)
+    grid = np.stack(np.meshgrid(*[np.arange(12) * 0.01] * 2), -1).reshape(-1, 2) + 0.3
+    time = np.arange(6)[:, None, None]
+    moving = grid + time * [3e-3, 1e-3]
+    chosen = rng.permutation(144)[:20] if name == "acceleration" else np.arange(20)
+    away = grid[chosen] - grid[chosen].mean(0) if name == "divergence" else rng.normal(size=(20, 2))
+    moving[-1, chosen] += 2e-2 * away if name == "divergence" else 2e-4 * away
+    history = moving.transpose(1, 0, 2).astype(np.float32)
+    state = state_of(rng, history=history, mobile=np.ones(144, bool), sigma=None)
+    policy = make_policy(name, AdaptiveConfig(tau=80, factor=1.5), k=0, seed=0)
+    extra = pairs(policy.edges(state)) - pairs(state.base())
+    assert extra
+    near = set(chosen.tolist())
+    if name == "divergence":  # neighbours of what parts see it, too
+        near |= {one for one, other in pairs(state.base()) if other in near}
+    assert all(one in near or other in near for one, other in extra)
+    assert not policy.needs_sigma
+
+
+@pytest.mark.parametrize("name", ["adaptive", "two-pass", "random", "acceleration", "divergence"])
 def test_every_policy_without_expansion_is_fixed(
     simulator: Simulator, trajectory: Trajectory, name: PolicyName
 ) -> None:

@@ -33,6 +33,7 @@ COLOURS = {
     "beta-nll": SERIES[3],
     "mse-denser": SERIES[4],
     "tuned": SERIES[2],
+    "decoupled": "#4f8f3a",
 }
 FIGURE_3 = (("mse", "fixed"), ("nll", "fixed"), ("nll", "adaptive"), ("nll", "random"))
 EXTRA_EDGE, BASE_EDGE = "#1fa774", "#c3cad3"

@@ -19,6 +19,7 @@ DENSER = 0.019 / 0.015
 MIDDLE = 0.0176 / 0.015
 """The same for the one that matches the adaptive graph's edges on its sand."""
 POLICIES: tuple[PolicyName, ...] = ("fixed", "adaptive", "random", "two-pass", "knn")
+PRIORS: tuple[PolicyName, ...] = ("acceleration", "divergence")
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,10 @@ class Model:
     radius: float | Literal["matched"] = 1.0
     """Times the radius of the data; matched: that whose graph has as many edges as the adaptive
     one in rollouts of the validation split, interpolated in the radius squared."""
-    graph: Literal["base", "adaptive"] = "base"
+    graph: Literal["base", "adaptive", "two-sided"] = "base"
+    variance_weight: float = 0.0
+    variance_ahead: bool = False
+    variance_layers: int = 1
     share: float = 1.0
     """Of the profile's training steps"""
     policies: tuple[PolicyName, ...] = ("fixed",)
@@ -53,10 +57,14 @@ class Model:
             seed=seed,
             graph=self.graph,
             adaptive=ADAPTIVE,
+            variance_weight=self.variance_weight,
+            variance_ahead=self.variance_ahead,
+            unroll=max(2, base.unroll) if self.variance_ahead else base.unroll,
             steps=max(1, round(self.share * base.steps)),
             model=replace(
                 base.model,
                 edges=self.edges,
+                variance_layers=self.variance_layers,
                 radius=None if factor == 1.0 else round(factor * radius, 6),
             ),
         )
@@ -78,10 +86,46 @@ EARLY = tuple(
     )
     for percent in (10, 30)
 )
+DECOUPLED = Model(
+    "decoupled",
+    "GNS, decoupled",
+    "decoupled",
+    policies=("fixed", "adaptive", "random"),
+)
+VARIANTS = (
+    DECOUPLED,
+    replace(
+        DECOUPLED,
+        name="decoupled-weight",
+        title="GNS, decoupled, latents shaped with weight 0.1",
+        variance_weight=0.1,
+    ),
+    replace(
+        DECOUPLED,
+        name="decoupled-deep",
+        title="GNS, decoupled, variance head of three layers",
+        variance_layers=3,
+    ),
+    replace(
+        DECOUPLED,
+        name="decoupled-ahead",
+        title="GNS, decoupled, sigma of the next step",
+        variance_weight=0.1,
+        variance_ahead=True,
+    ),
+    replace(
+        NLL,
+        name="nll-two-sided",
+        title="AdaptGNS, trained on two-sided graphs",
+        graph="two-sided",
+        policies=("fixed", "two-sided"),
+    ),
+)
 PAPER_MODELS = (
-    MSE,
-    NLL,
+    replace(MSE, policies=(*MSE.policies, *PRIORS)),
+    replace(NLL, policies=(*POLICIES, "two-sided", *PRIORS)),
     MLP,
+    *VARIANTS,
     *EARLY,
     replace(MSE, name="mse-denser", title="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)),
     replace(NLL, name="nll-middle", title="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)),
@@ -137,7 +181,14 @@ class Profile:
 PROFILES: dict[ProfileName, Profile] = {
     "smoke": Profile(
         base=replace(PRESETS["smoke"], steps=12, validate_every=12, validate_horizon=5),
-        models=(MSE, NLL, MLP, EARLY[1], TUNED),
+        models=(
+            MSE,
+            replace(NLL, policies=(*POLICIES, "two-sided", *PRIORS)),
+            MLP,
+            EARLY[1],
+            DECOUPLED,
+            TUNED,
+        ),
         sweep=Sweep(tau=(70.0,), factor=(1.1, 1.267), radius=(0.9, 1.0)),
         seeds=(0, 1),
         marks=(5, 10),

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -392,7 +392,7 @@ class Run:
         last = self.folder / LAST
         if last.exists():
             checkpoint = read_checkpoint(last)
-            refuse_difference(str(last), to_json(checkpoint.config), to_json(config))
+            refuse_difference(str(last), checkpoint.config, config)
             if checkpoint.step == config.steps:
                 return
             config = replace(config, resume=self.folder)
@@ -439,8 +439,15 @@ class Run:
                 f"--only '{self.name}'`"
             )
         row: dict[str, Any] = read_json(path)["rollouts"][0]
-        refuse_difference(str(path), row["settings"]["training"], to_json(self.config()))
-        refuse_difference(str(path), row["settings"], to_json(self.rollout_config(policy)))
+        settings = row["settings"]
+        trained = from_json(TrainConfig, settings["training"], source=str(path))
+        refuse_difference(str(path), trained, self.config())
+        asked = self.rollout_config(policy)
+        # What older files lack has its default.
+        known = {name: settings[name] for name in to_json(asked) if name in settings}
+        local = {"checkpoint": "", "out": ""}
+        made = from_json(RolloutConfig, {**local, **known}, source=str(path))
+        refuse_difference(str(path), made, asked)
         return row
 
 
@@ -468,12 +475,13 @@ def valid_edges(data: DataSet, model: Model, seed: int, policy: PolicyName) -> f
     return float(read_json(path)["rollouts"][0]["scalars"]["edges_per_step"]["mean"])
 
 
-def refuse_difference(path: str, made: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+def refuse_difference(path: str, made: object, wanted: object) -> None:
     """Raise StudyError where two configurations differ in more than where and how they ran."""
-    for name, value in wanted.items():
-        if name not in LOCAL and made.get(name, value) != value:
+    found = to_json(made)
+    for name, value in to_json(wanted).items():
+        if name not in LOCAL and found[name] != value:
             raise StudyError(
-                f"{path}: was made with {name} {made[name]}; the study has {value}. Remove it, or "
+                f"{path}: was made with {name} {found[name]}; the study has {value}. Remove it, or "
                 "give another --out"
             )
 

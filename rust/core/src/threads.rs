@@ -40,6 +40,8 @@ struct Helpers {
     process: u32,
     count: usize,
     pool: Option<ThreadPool>,
+    /// Whether a [`team`] has them, to whose end they are nobody else's.
+    taken: AtomicBool,
 }
 
 static HELPERS: AtomicPtr<Helpers> = AtomicPtr::new(std::ptr::null_mut());
@@ -69,6 +71,7 @@ fn helpers() -> &'static Helpers {
         process,
         count,
         pool,
+        taken: AtomicBool::new(false),
     }));
     match HELPERS.compare_exchange(current, fresh, Ordering::AcqRel, Ordering::Acquire) {
         // SAFETY: `fresh` was just leaked and is published, so it lives for ever.
@@ -87,7 +90,7 @@ pub fn map<I: Send, R: Send>(
     items: Vec<I>,
     task: impl Fn(I) -> R + Sync,
 ) -> Vec<R> {
-    let Some((pool, spawned)) = helpers_for(threads, items.len()) else {
+    let Some((_, pool, spawned)) = helpers_for(threads, items.len()) else {
         return items.into_iter().map(task).collect();
     };
     share(items, task, |work| {
@@ -100,8 +103,12 @@ pub fn map<I: Send, R: Send>(
     })
 }
 
-/// The pool and how many of it may help with `count` items; `None` if the caller works alone.
-fn helpers_for(threads: Threads, count: usize) -> Option<(&'static ThreadPool, usize)> {
+/// The helpers, and how many of their pool may help with `count` items; `None` if the caller works
+/// alone, as it does beside a [`team`]: waiting for that would take longer.
+fn helpers_for(
+    threads: Threads,
+    count: usize,
+) -> Option<(&'static Helpers, &'static ThreadPool, usize)> {
     let wanted = match threads {
         Threads::All => usize::MAX,
         Threads::AtMost(limit) => limit.get(),
@@ -110,8 +117,11 @@ fn helpers_for(threads: Threads, count: usize) -> Option<(&'static ThreadPool, u
         return None;
     }
     let helpers = helpers();
+    if helpers.taken.load(Ordering::Relaxed) {
+        return None;
+    }
     let spawned = helpers.count.min(wanted - 1).min(count - 1);
-    helpers.pool.as_ref().map(|pool| (pool, spawned))
+    helpers.pool.as_ref().map(|pool| (helpers, pool, spawned))
 }
 
 /// `task` of every item, in order; `run` calls what it is given on as many threads as it likes.
@@ -160,7 +170,8 @@ unsafe impl Sync for Helped<'_> {}
 
 /// What `body` returns, which may share its work with up to `threads` threads.
 pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
-    let helpers = helpers_for(threads, usize::MAX);
+    let helpers = helpers_for(threads, usize::MAX)
+        .filter(|(helpers, ..)| !helpers.taken.swap(true, Ordering::Relaxed));
     let team = Team {
         work: UnsafeCell::new(None),
         open: AtomicUsize::new(0),
@@ -169,9 +180,10 @@ pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
         over: AtomicBool::new(false),
         helped: helpers.is_some(),
     };
-    let Some((pool, spawned)) = helpers else {
+    let Some((helpers, pool, spawned)) = helpers else {
         return body(&team);
     };
+    let _given_back = OnDrop(|| helpers.taken.store(false, Ordering::Relaxed));
     let helped = Helped(&team);
     pool.in_place_scope(|scope| {
         // Also where `body` panics: the scope waits for the helpers.
@@ -276,6 +288,28 @@ mod tests {
             });
             assert_eq!(total, (2_000..2_040).collect::<Vec<u64>>());
         }
+    }
+
+    #[test]
+    fn beside_a_team_one_works_alone() {
+        let shares = |threads| {
+            let ids = team(threads, |team| {
+                team.map((0..64).collect(), |_: i32| std::thread::current().id())
+            });
+            ids.iter().all(|&id| id == std::thread::current().id())
+        };
+        team(Threads::All, |_| {
+            std::thread::scope(|scope| {
+                // Neither waits for the team around it, which ends after them.
+                assert!(scope.spawn(|| shares(Threads::All)).join().unwrap());
+                let mapped = scope.spawn(|| map(Threads::All, vec![1, 2, 3], |x| 2 * x));
+                assert_eq!(mapped.join().unwrap(), [2, 4, 6]);
+            });
+        });
+        assert_eq!(
+            team(Threads::All, |team| team.map(vec![1, 2, 3], |x| 2 * x)),
+            [2, 4, 6]
+        );
     }
 
     #[test]

@@ -5,7 +5,7 @@ use adaptgns_core::network::{Edges, Features, Layer, Linear, Mlp, Network, Norm,
 use adaptgns_core::threads::Threads;
 use numpy::prelude::*;
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayDyn, PyReadonlyArrayDyn};
-use pyo3::exceptions::PyTypeError;
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 
 use crate::arguments;
@@ -66,6 +66,10 @@ impl<'py> Arguments<'py> {
     }
 
     fn features(&self) -> PyResult<Features<'_>> {
+        check_rows("node_features", &self.nodes, self.perceptrons.first())?;
+        if let Some((values, _)) = &self.edges {
+            check_rows("edge_features", values, self.perceptrons.get(1))?;
+        }
         let edges = match &self.edges {
             None => None,
             Some((values, indices)) => {
@@ -151,6 +155,19 @@ fn reals<'py>(argument: &str, value: &Bound<'py, PyAny>) -> PyResult<Reals<'py>>
     }
 }
 
+/// Rows as wide as the first map of their encoder takes them.
+fn check_rows(argument: &str, rows: &Reals<'_>, encoder: Option<&Vec<Reals<'_>>>) -> PyResult<()> {
+    let weight = encoder.and_then(|arrays| arrays.first());
+    let wanted = weight.and_then(|weight| weight.shape().get(1).copied());
+    match (rows.shape(), wanted) {
+        (&[_, width], Some(wanted)) if width == wanted => Ok(()),
+        (_, None) => Ok(()), // which the network's own check tells
+        (shape, Some(wanted)) => Err(PyValueError::new_err(format!(
+            "{argument}: got the shape {shape:?}, must be rows of {wanted}"
+        ))),
+    }
+}
+
 /// Weights and biases in turn, then perhaps scale and shift.
 fn perceptron<'a>(arrays: &'a [Reals<'_>]) -> PyResult<Mlp<'a>> {
     let (pairs, rest) = arrays.as_chunks::<2>();
@@ -161,6 +178,13 @@ fn perceptron<'a>(arrays: &'a [Reals<'_>]) -> PyResult<Mlp<'a>> {
     for [first, second] in pairs {
         let (first_slice, second_slice) = (first.as_slice()?, second.as_slice()?);
         if first.ndim() == 2 && mlp.norm.is_none() {
+            if first.shape()[0] != second_slice.len() {
+                return Err(invalid(format!(
+                    "got a weight of shape {:?} for {} biases",
+                    first.shape(),
+                    second_slice.len()
+                )));
+            }
             mlp.linears.push(Linear::new(first_slice, second_slice));
         } else {
             mlp.norm = Some(Norm {
@@ -215,7 +239,8 @@ type PythonGradients<'py> = (
 
 /// Gradients by the parameters and the features; `_core.pyi` has the whole contract.
 #[pyfunction]
-#[pyo3(signature = (perceptrons, node_features, edges, tape, gradients, *, threads = None))]
+#[expect(clippy::too_many_arguments, reason = "keyword arguments in Python")]
+#[pyo3(signature = (perceptrons, node_features, edges, tape, gradients, *, alone = false, threads = None))]
 fn network_backward<'py>(
     py: Python<'py>,
     perceptrons: &Bound<'py, PyAny>,
@@ -223,6 +248,7 @@ fn network_backward<'py>(
     edges: Option<(Bound<'py, PyAny>, Vec<Bound<'py, PyAny>>)>,
     tape: &NetworkTape,
     gradients: Vec<Bound<'py, PyAny>>,
+    alone: bool,
     threads: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<PythonGradients<'py>> {
     let arguments = Arguments::new(perceptrons, node_features, edges, gradients.len(), threads)?;
@@ -240,7 +266,7 @@ fn network_backward<'py>(
                 .0
                 .lock()
                 .unwrap_or_else(std::sync::PoisonError::into_inner);
-            network.backward(features, &mut tape, &gradients, threads)
+            network.backward(features, &mut tape, &gradients, alone, threads)
         })
         .map_err(to_python)?;
     Ok((

@@ -80,11 +80,19 @@ impl Network<'_> {
         let count = self.node_count(features);
         let edges = features.edges.map_or(0, |(_, edges)| edges.senders.len());
         let width = self.width();
+        let mut layers = self.layers.iter().zip(&tape.layers);
         require(
             tape.nodes.len() == count * width
                 && tape.edges.len() == edges * width
                 && tape.layers.len() == self.layers.len()
-                && tape.heads.len() == self.heads.len(),
+                && tape.heads.len() == self.heads.len()
+                && self.node_encoder.fits(&tape.node_encoder, count)
+                && (self.edge_encoder.iter()).all(|mlp| mlp.fits(&tape.edge_encoder, edges))
+                && layers.all(|(layer, kept)| {
+                    layer.node.fits(&kept.node, count)
+                        && layer.edge.iter().all(|mlp| mlp.fits(&kept.edge, edges))
+                })
+                && (self.heads.iter().zip(&tape.heads)).all(|(mlp, kept)| mlp.fits(kept, count)),
             "tape",
             || "comes from another network or other features".into(),
         )?;

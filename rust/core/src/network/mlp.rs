@@ -115,6 +115,15 @@ impl<'a> Mlp<'a> {
         self.linears.last().map_or(0, Linear::outputs)
     }
 
+    /// Whether `kept` is what a forward pass of `rows` rows keeps.
+    pub(super) fn fits(&self, kept: &Kept, rows: usize) -> bool {
+        let normed = if self.norm.is_some() { rows } else { 0 };
+        (kept.hidden.iter().map(|hidden| hidden.len()))
+            .eq(self.hidden_widths().map(|width| rows * width))
+            && kept.normalized.len() == normed * self.outputs()
+            && kept.inverse_std.len() == normed
+    }
+
     pub(super) fn hidden_widths(&self) -> impl Iterator<Item = usize> {
         self.linears[..self.linears.len() - 1]
             .iter()

@@ -9,7 +9,8 @@
 //! threads.
 //!
 //! The backward pass needs every layer's edges. It takes them from the last layer's by undoing one
-//! residual after the other, so a step keeps no edges but the last.
+//! residual after the other, so a step keeps no edges but the last. What rounding that adds is below
+//! that of the passes themselves, unless LayerNorms scale by a thousand.
 
 mod buffer;
 mod check;
@@ -236,18 +237,20 @@ impl Network<'_> {
     }
 
     /// The gradients that follow from those of the heads' outputs, after a forward pass over the
-    /// same parameters and `features` that kept `tape`.
+    /// same parameters and `features` that kept `tape`. With `alone`, the heads behind the first
+    /// learn without a word to the rest of the network.
     pub fn backward(
         &self,
         features: Features<'_>,
         tape: &mut Tape,
         heads: &[&[f32]],
+        alone: bool,
         threads: Threads,
     ) -> Result<Gradients, crate::Error> {
         self.check(&features)?;
         self.check_tape(&features, tape, heads)?;
         Ok(threads::team(threads, |team| {
-            self.pass_backward(features, tape, heads, team)
+            self.pass_backward(features, tape, heads, alone, team)
         }))
     }
 
@@ -256,6 +259,7 @@ impl Network<'_> {
         features: Features<'_>,
         tape: &mut Tape,
         heads: &[&[f32]],
+        alone: bool,
         team: &Team,
     ) -> Gradients {
         let width = self.width();
@@ -270,7 +274,11 @@ impl Network<'_> {
         let mut parameters: Vec<Buffer> = Vec::new();
 
         let mut to_nodes = Buffer::zeros(count * width);
-        for ((head, kept), gradient) in self.heads.iter().zip(&mut tape.heads).zip(heads).rev() {
+        let own = self.heads.iter().zip(&mut tape.heads).zip(heads);
+        for (number, ((head, kept), gradient)) in own.enumerate().rev() {
+            if alone && number == 0 {
+                to_nodes.fill(0.0);
+            }
             let inputs = [whole_input(head, &tape.nodes)];
             let mut targets = [(&mut to_nodes[..], 0)];
             parameters.push(pass.backward(head, &inputs, kept, gradient, &mut targets));
@@ -939,7 +947,7 @@ mod tests {
         let ones = vec![1.0; out[0].len()];
         let mut tape = tape.unwrap();
         let gradients = network
-            .backward(features, &mut tape, &[&ones], threads)
+            .backward(features, &mut tape, &[&ones], false, threads)
             .unwrap();
         let all = [gradients.parameters, gradients.nodes, gradients.edges].concat();
         (out.concat(), all)
