@@ -108,6 +108,23 @@ def test_without_its_package_or_with_another_suffix_no_film(
         assert not (tmp_path / name).exists()
 
 
+def test_without_a_program_no_film(
+    tmp_path: Path,
+    adaptive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is missing")
+    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE", raising=False)
+    monkeypatch.setattr(imageio_ffmpeg._utils, "_get_ffmpeg_exe", lambda: None)
+    with pytest.raises(SystemExit, match="2"):
+        main(["animate", "--rollout", str(adaptive), "--out", str(tmp_path / "a.mp4")])
+    told = capsys.readouterr().err
+    assert "which imageio-ffmpeg doesn't bring for this machine: install ffmpeg" in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "a.mp4").exists()
+
+
 def test_sigma_colours_the_prediction_alone(tmp_path: Path, metadata: Metadata) -> None:
     path = write_rollout(tmp_path / "a.h5", metadata)
     before = picture(path)
