@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 
 def publish(partial: Path, final: Path) -> None:
@@ -64,3 +67,20 @@ def replace_text(path: Path, text: str) -> None:
     """Write ``text`` to ``path``, replacing what is there only once all of it is on disk."""
     with written_whole(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write ``content`` with six significant digits, whole or not at all."""
+    replace_text(path, json.dumps(_six_digits(content), allow_nan=False) + "\n")
+
+
+def _six_digits(value: Any) -> Any:
+    match value:
+        case dict():
+            return {key: _six_digits(item) for key, item in value.items()}
+        case list() | tuple():
+            return [_six_digits(item) for item in value]
+        case float():
+            return float(f"{value:.6g}") if math.isfinite(value) else None
+        case _:
+            return value

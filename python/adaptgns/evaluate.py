@@ -32,6 +32,7 @@ from adaptgns.metrics import (
     one_step_mse,
     position_mse,
     spearman,
+    transport_cost,
 )
 from adaptgns.report import Measures, Report
 from adaptgns.rollout_file import Rollout, RolloutFile
@@ -41,6 +42,8 @@ MARKS = (50, 100, 200)
 STATISTICS_STEP = 100
 """Step of the graph statistics, as in table 2 of the paper"""
 DECILES = 10
+MATCHED = 2_000
+"""Particles up to which clouds are matched: a second for each pair of clouds"""
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
             for tally, rollout in zip(tallies, rollouts, strict=True):
                 predicted = rollout.predicted
                 tally.add_positions(truth, predicted, marks)
+                tally.add_transport(truth, predicted, marks)
                 tally.add_density(truth, predicted)
                 tally.add_graph(rollout)
                 tally.add_one_step(rollout, truth)
@@ -199,6 +203,20 @@ class Tally:
         for mark, row, ratio in zip(reached, rows, density, strict=True):
             self.scalars[f"mse@{mark}"].append(mse[row])
             self.scalars[f"clumping@{mark}"].append(ratio)
+
+    def add_transport(self, truth: Truth, predicted: Floats, marks: Iterable[int]) -> None:
+        """Match the clouds at ``marks``, where that does not take long."""
+        if truth.mobile.sum() > MATCHED:
+            return
+        for mark in marks:
+            if mark <= len(predicted):
+                cost = transport_cost(
+                    predicted[mark - 1],
+                    truth.positions[mark - 1],
+                    truth.mobile,
+                    truth.metadata.box,
+                )
+                self.scalars[f"transport@{mark}"].append(cost)
 
     def add_density(self, truth: Truth, predicted: Floats) -> None:
         """Count the edges within the data's own radius at every step, whatever the policy."""

@@ -54,17 +54,8 @@ class Figures:
 
         Each file is written whole or not at all.
         """
-        paths = []
         with mpl.rc_context(STYLE):  # type: ignore[arg-type]
-            for name, figure in self._drawn():
-                for form in FORMATS:
-                    path = folder / f"{name}.{form}"
-                    # No date in the file: the same runs give the same bytes.
-                    metadata = {"CreationDate": None} if form == "pdf" else None
-                    with written_whole(path) as partial:
-                        figure.savefig(partial, format=form, dpi=DPI, metadata=metadata)
-                    paths.append(path)
-        return paths
+            return [path for name, figure in self._drawn() for path in save(figure, folder, name)]
 
     def _drawn(self) -> Iterator[tuple[str, Figure]]:
         if any(run.log for run in self._runs):
@@ -88,7 +79,7 @@ class Figures:
                 _logarithmic(ax)
         axes[1].set_ylabel("MSE, normalized units²")
         axes[2].set_ylabel("MSE, length²")
-        _legend(figure, axes[0])
+        legend(figure, axes[0])
         return figure
 
     def _steps(self) -> Figure:
@@ -109,7 +100,7 @@ class Figures:
         _logarithmic(errors)
         edges.set(title="directed edges of a step", xlabel="step")
         edges.set_ylim(bottom=0)
-        _legend(figure, errors)
+        legend(figure, errors)
         return figure
 
     def _calibration(self) -> Figure:
@@ -139,7 +130,7 @@ class Figures:
             xlabel="predicted, d·σ², normalized units²",
             ylabel="measured, normalized units²",
         )
-        _legend(figure, axes)
+        legend(figure, axes)
         return figure
 
     def _pareto(self) -> Figure:
@@ -167,7 +158,7 @@ class Figures:
         for axes in panels:
             axes.margins(0.25)
             _logarithmic(axes)
-        _legend(figure, panels[0])
+        legend(figure, panels[0])
         return figure
 
     def _colours(self) -> list[str]:
@@ -179,6 +170,19 @@ class Figures:
             return self._colours()[[run.name for run in self._runs].index(rollout.run)]
         models = list(dict.fromkeys((other.label, other.radius) for other in self._rollouts))
         return SERIES[models.index((rollout.label, rollout.radius)) % len(SERIES)]
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write ``figure`` as PNG and PDF into ``folder``, each whole or not at all."""
+    paths = []
+    for form in FORMATS:
+        path = folder / f"{name}.{form}"
+        # No date in the file: the same runs give the same bytes.
+        metadata = {"CreationDate": None} if form == "pdf" else None
+        with written_whole(path) as partial:
+            figure.savefig(partial, format=form, dpi=DPI, metadata=metadata)
+        paths.append(path)
+    return paths
 
 
 def write_figures(runs: Sequence[Path], folder: Path) -> list[Path]:
@@ -219,7 +223,8 @@ def _logarithmic(axes: Axes) -> None:
         axes.set_yscale("log")
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
+def legend(figure: Figure, axes: Axes) -> None:
+    """A legend below the panels, with what ``axes`` show."""
     handles, labels = axes.get_legend_handles_labels()
     columns = max(1, int(figure.get_figwidth() // (0.5 + 0.07 * max(map(len, labels)))))
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)

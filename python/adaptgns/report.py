@@ -130,6 +130,7 @@ class Report:
             Column("Spearman", [_number(row.spearman, ".3f") for row in rows]),
             scalar("edges\n/step", "edges_per_step", ",.0f"),
             *(scalar(f"clumping\n@{mark}", f"clumping@{mark}", ".2f") for mark in self.marks),
+            scalar(f"transport\n@{self.marks[-1]}", f"transport@{self.marks[-1]}", ".2e"),
             scalar("kinetic\nerror", "kinetic_energy_error", ".3g"),
             scalar("graph\nms", "graph_ms", ".2f"),
             scalar("model\nms", "model_ms", ".2f"),

@@ -17,6 +17,7 @@ from adaptgns.metrics import (
     one_step_mse,
     position_mse,
     spearman,
+    transport_cost,
 )
 from adaptgns.periodic import minimum_image
 
@@ -54,6 +55,22 @@ def test_small_errors_are_not_lost_to_single_precision() -> None:
     # Squares of float32 values near 1e-23 underflow in float32.
     true = np.zeros((1, 4, 2), dtype=np.float32)
     assert position_mse(true + np.float32(1e-23), true, ALL)[0] == pytest.approx(1e-46)
+
+
+def test_transport_matches_whichever_particle_is_nearest() -> None:
+    true = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [5.0, 5.0]], np.float32)
+    mobile = np.array([True, True, True, False])
+    swapped = true[[1, 2, 0, 3]]
+    assert transport_cost(swapped, true, mobile) == 0.0
+    moved = swapped + np.array([[0.1, 0], [0, 0], [0, 0], [9, 9]], np.float32)
+    assert transport_cost(moved, true, mobile) == pytest.approx(0.01 / 3, rel=1e-5)
+    # A period of 1 along the first axis makes the first two the same place.
+    near = true.copy()
+    near[0, 0] = 0.95
+    periodic = transport_cost(near, true, mobile, np.array([1.0, np.inf]))
+    assert periodic == pytest.approx(0.0025 / 3, rel=1e-3)
+    near[2] = np.nan
+    assert np.isnan(transport_cost(near, true, mobile))
 
 
 def test_kinetic_energy_of_free_fall() -> None:

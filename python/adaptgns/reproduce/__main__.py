@@ -1,0 +1,3 @@
+from adaptgns.reproduce import main
+
+main()

@@ -1,0 +1,279 @@
+"""The figures of a study's report: vector and PNG, a model in one colour and a policy in one dash
+everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from adaptgns import figures
+from adaptgns.figures import BASELINE, DASHES, MARKERS, STYLE, save
+from adaptgns.graph import adaptive_graph
+from adaptgns.palette import SERIES, SIGMA_MAP
+from adaptgns.reproduce.profiles import ADAPTIVE
+from adaptgns.reproduce.results import Results, Series
+from adaptgns.reproduce.runs import DataSet
+from adaptgns.reproduce.tables import series_label
+
+COLOURS = {
+    "mse": SERIES[0],
+    "nll": SERIES[1],
+    "mlp": SERIES[5],
+    "nll-adaptive": SERIES[2],
+    "beta-nll": SERIES[3],
+    "mse-denser": SERIES[4],
+    "tuned": SERIES[2],
+}
+FIGURE_3 = (("mse", "fixed"), ("nll", "fixed"), ("nll", "adaptive"), ("nll", "random"))
+EXTRA_EDGE, BASE_EDGE = "#1fa774", "#c3cad3"
+WIDTH = 6.6
+
+
+def write(results: Results, folder: Path) -> list[Path]:
+    """Write the figures into ``folder``; the PNG files, in the order of the report."""
+    paths = []
+    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
+        for name, figure in _drawn(results):
+            paths.append(next(p for p in save(figure, folder, name) if p.suffix == ".png"))
+    return paths
+
+
+def _drawn(results: Results) -> Iterator[tuple[str, Figure]]:
+    sets = list(results.study.sets.values())
+    yield "statistics", _statistics(sets)
+    snapshots = {data.name: _snapshot(results, data) for data in sets}
+    if all(snapshots.values()):
+        yield "graphs", _graphs(results, snapshots)
+        yield "sigma", _sigma(snapshots)
+    yield "steps", _steps(results, sets)
+    yield "pareto", _pareto(results, sets)
+    yield "reliability", _reliability(results, sets)
+    yield "clouds", _clouds(results, sets)
+
+
+def colour(series: Series) -> str:
+    """That of its model, or of the one it is a variant of."""
+    name = series.model.name
+    return COLOURS.get(name) or COLOURS[name.split("-", maxsplit=1)[0]]
+
+
+def _panels(count: int, height: float, rows: int = 1) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    return figure, figure.subplots(rows, count, squeeze=False)
+
+
+def _statistics(sets: list[DataSet]) -> Figure:
+    """Table 2 along the time."""
+    figure, ((edges, degree, clustering),) = _panels(3, 2.3)
+    for data, tint in zip(sets, (SERIES[2], SERIES[3], SERIES[0], SERIES[1]), strict=False):
+        described = data.described
+        shortest = min(len(course) for course in described["evolution"])
+        steps = described["evolution_every"] * np.arange(shortest)
+        for ax, name in ((edges, "edges"), (degree, "degree"), (clustering, "clustering")):
+            values = np.array(
+                [[frame[name] for frame in course[:shortest]] for course in described["evolution"]]
+            )
+            mean, spread = values.mean(0), values.std(0)
+            ax.plot(steps, mean, color=tint, label=data.name)
+            ax.fill_between(steps, mean - spread, mean + spread, color=tint, alpha=0.2, lw=0)
+    for ax, title in (
+        (edges, "undirected edges"),
+        (degree, "average degree"),
+        (clustering, "average clustering"),
+    ):
+        ax.set(title=title, xlabel="step")
+    figures.legend(figure, edges)
+    return figure
+
+
+def _snapshot(results: Results, data: DataSet) -> dict[str, NDArray[Any]] | None:
+    """Frames of the adaptive rollout of the first seed."""
+    series = results.find(data.name, "nll", "adaptive")
+    if series is None:
+        return None
+    path = series.runs[0].metrics("adaptive").with_suffix(".npz")
+    if not path.exists():
+        return None
+    with np.load(path) as file:
+        return dict(file)
+
+
+def _graphs(results: Results, snapshots: dict[str, Any]) -> Figure:
+    """Figure 1: the graph, with the edges that uncertainty adds, at the last step kept."""
+    figure, (panels,) = _panels(len(snapshots), 3.2)
+    for ax, (name, frames) in zip(panels, snapshots.items(), strict=True):
+        positions, sigma = frames["predicted"][-1], frames["sigma"][-1]
+        radius = results.study.sets[name].described["radius"]
+        edges = adaptive_graph(positions, sigma, radius, ADAPTIVE.tau, ADAPTIVE.factor)
+        edges = edges[:, edges[0] < edges[1]]
+        ends = positions[edges][..., :2]  # [2, E, d]
+        far = np.linalg.norm(ends[0] - ends[1], axis=1) > radius
+        for chosen, tint, width in ((~far, BASE_EDGE, 0.35), (far, EXTRA_EDGE, 0.5)):
+            lines = ends[:, chosen].transpose(1, 0, 2)
+            ax.add_collection(LineCollection(list(lines), colors=tint, linewidths=width))
+        order = np.argsort(sigma)
+        ax.scatter(*positions[order, :2].T, c=sigma[order], s=2.5, cmap=SIGMA_MAP, zorder=3, lw=0)
+        step = int(frames["steps"][-1])
+        ax.set_title(f"{name}, step {step}: {int(far.sum()):,} of {len(far):,} edges are extra")
+        _to_scale(ax)
+    return figure
+
+
+def _sigma(snapshots: dict[str, Any]) -> Figure:
+    """Figure 2: where the model is unsure, at three steps."""
+    figure, rows = _panels(3, 2.3 * len(snapshots), len(snapshots))
+    for panels, (name, frames) in zip(rows, snapshots.items(), strict=True):
+        shown = range(min(3, len(frames["steps"])))
+        low, high = np.quantile(frames["sigma"][list(shown)], (0.02, 0.98))
+        for ax, row in zip(panels, shown, strict=False):
+            positions, sigma = frames["predicted"][row], frames["sigma"][row]
+            order = np.argsort(sigma)
+            ax.scatter(
+                *positions[order, :2].T, c=sigma[order], s=2, cmap=SIGMA_MAP, vmin=low, vmax=high
+            )
+            ax.set_title(f"{name}, step {int(frames['steps'][row])}")
+            _to_scale(ax)
+        scale = ScalarMappable(Normalize(low, high), SIGMA_MAP)
+        figure.colorbar(scale, ax=list(panels), label="σ, normalized", shrink=0.8)
+    return figure
+
+
+def _steps(results: Results, sets: list[DataSet]) -> Figure:
+    """Figure 3: edges and error at every step."""
+    figure, rows = _panels(2, 2.3 * len(sets), len(sets))
+    for (edges, errors), data in zip(rows, sets, strict=True):
+        for model, policy in FIGURE_3:
+            series = results.find(data.name, model, policy)  # type: ignore[arg-type]
+            if series is None:
+                continue
+            for ax, name in ((edges, "edges"), (errors, "mse")):
+                curves = series.curve(name)
+                _band(ax, curves, series)
+        first = results.of(data.name)[0]
+        true = first.curve("edges_within_radius_true").mean(0)
+        edges.plot(np.arange(1, len(true) + 1), true, color=BASELINE, label="true positions")
+        edges.set(title=f"{data.name}: directed edges of a step", xlabel="step")
+        errors.set(title=f"{data.name}: position MSE, length²", xlabel="step", yscale="log")
+    figures.legend(figure, rows[0][0])
+    return figure
+
+
+def _band(ax: Axes, curves: NDArray[np.float64], series: Series) -> None:
+    """The mean over the seeds, and from the lowest to the highest."""
+    steps = np.arange(1, curves.shape[1] + 1)
+    tint = colour(series)
+    ax.plot(
+        steps,
+        curves.mean(0),
+        color=tint,
+        linestyle=DASHES[series.policy],
+        label=series_label(series),
+    )
+    ax.fill_between(steps, curves.min(0), curves.max(0), color=tint, alpha=0.12, lw=0)
+
+
+def _pareto(results: Results, sets: list[DataSet]) -> Figure:
+    mark = results.study.last_mark
+    figure, rows = _panels(2, 2.6 * len(sets), len(sets))
+    for panels, data in zip(rows, sets, strict=True):
+        for ax, unit in zip(panels, ("directed edges a step", "milliseconds a step"), strict=True):
+            for series in results.of(data.name):
+                if not series.model.edges or series.model.share < 1:
+                    continue
+                error = series.estimate(f"mse@{mark}")
+                cost = series.scalar("edges_per_step").mean()
+                if unit.startswith("milli"):
+                    time = data.times[f"{series.model.name}, {series.policy}"]
+                    cost = time["graph_ms"] + time["model_ms"]
+                ax.errorbar(
+                    cost,
+                    error.mean,
+                    yerr=[[error.mean - error.low], [error.high - error.mean]],
+                    color=colour(series),
+                    marker=MARKERS[series.policy],
+                    linestyle="none",
+                    capsize=2,
+                    label=series_label(series),
+                )
+            ax.set(title=f"{data.name}: MSE@{mark}, length²", xlabel=unit, yscale="log")
+            ax.margins(0.15)
+    figures.legend(figure, rows[0][0])
+    return figure
+
+
+def _reliability(results: Results, sets: list[DataSet]) -> Figure:
+    figure, (panels,) = _panels(len(sets), 3.2)
+    for ax, data in zip(panels, sets, strict=True):
+        ends: list[float] = []
+        for series in results.of(data.name):
+            if series.policy != "fixed":
+                continue
+            predicted, measured = (series.calibration(n) for n in ("predicted", "squared_error"))
+            for seed, (one, other) in enumerate(zip(predicted, measured, strict=True)):
+                ax.plot(
+                    one,
+                    other,
+                    color=colour(series),
+                    alpha=0.4 + 0.6 * series.model.share,
+                    linestyle="-" if series.model.share == 1 else ":",
+                    marker="o",
+                    markersize=2.5,
+                    label=series.model.title if seed == 0 else None,
+                )
+                ends += [*one, *other]
+        if ends:
+            line = [min(ends), max(ends)]
+            ax.plot(line, line, color=BASELINE, lw=0.8, label="calibrated")
+        ax.set(
+            title=f"{data.name}: squared error, deciles of σ",
+            xlabel="predicted, d·σ², normalized²",
+            ylabel="measured, normalized²",
+            xscale="log",
+            yscale="log",
+        )
+    figures.legend(figure, panels[0])
+    return figure
+
+
+def _clouds(results: Results, sets: list[DataSet]) -> Figure:
+    """Kinetic energy along the rollout, and the distance between the clouds at the marks."""
+    marks = results.study.profile.marks
+    figure, rows = _panels(2, 2.3 * len(sets), len(sets))
+    for (energy, transport), data in zip(rows, sets, strict=True):
+        for model, policy in FIGURE_3:
+            series = results.find(data.name, model, policy)  # type: ignore[arg-type]
+            if series is None:
+                continue
+            _band(energy, series.curve("kinetic_energy"), series)
+            values = [series.estimate(f"transport@{mark}").mean for mark in marks]
+            transport.plot(
+                marks,
+                values,
+                color=colour(series),
+                linestyle=DASHES[policy],
+                marker=MARKERS[policy],
+                markersize=3,
+            )
+        true = results.of(data.name)[0].curve("kinetic_energy_true").mean(0)
+        energy.plot(np.arange(1, len(true) + 1), true, color=BASELINE, label="truth")
+        energy.set(title=f"{data.name}: kinetic energy per mass, (length/time)²", xlabel="step")
+        transport.set(title=f"{data.name}: transport cost, length²", xlabel="step", yscale="log")
+    figures.legend(figure, rows[0][0])
+    return figure
+
+
+def _to_scale(ax: Axes) -> None:
+    ax.set_aspect("equal", "datalim")
+    ax.set(xticks=[], yticks=[])
+    for side in ax.spines.values():
+        side.set_visible(False)

@@ -1,0 +1,196 @@
+"""What is trained and rolled out, at which size: the models of the paper, and the profiles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from adaptgns.config import AdaptiveConfig, Loss, PolicyName, TrainConfig
+from adaptgns.data.generation import SplitPlan
+from adaptgns.presets import PRESETS
+
+ProfileName = Literal["smoke", "laptop", "full", "paper"]
+
+ADAPTIVE = AdaptiveConfig()
+"""The paper's rule: tau 70, factor 1.267."""
+DENSER = 0.019 / 0.015
+"""Radius of the paper's denser graph over that of its sparse one."""
+MIDDLE = 0.0176 / 0.015
+"""The same for the one that matches the adaptive graph's edges on its sand."""
+POLICIES: tuple[PolicyName, ...] = ("fixed", "adaptive", "random", "two-pass", "knn")
+
+
+@dataclass(frozen=True)
+class Model:
+    """One way of training, run with every seed."""
+
+    name: str
+    title: str
+    loss: Loss
+    edges: bool = True
+    radius: float | Literal["matched"] = 1.0
+    """Times the radius of the data; matched: that whose graph has as many edges as the adaptive
+    one in rollouts of the validation split, interpolated in the radius squared."""
+    graph: Literal["base", "adaptive"] = "base"
+    share: float = 1.0
+    """Of the profile's training steps"""
+    policies: tuple[PolicyName, ...] = ("fixed",)
+    weights: str | None = None
+    """Name of the model whose training it uses, under the rule that the sweep chose"""
+
+    @property
+    def depends(self) -> bool:
+        """Whether it comes after the other models."""
+        return self.weights is not None or self.radius == "matched"
+
+    def config(self, base: TrainConfig, seed: int, radius: float) -> TrainConfig:
+        """Of its training, by the profile's ``base``; ``radius`` is that of the data."""
+        factor = 1.0 if self.radius == "matched" else self.radius
+        return replace(
+            base,
+            loss=self.loss,
+            seed=seed,
+            graph=self.graph,
+            adaptive=ADAPTIVE,
+            steps=max(1, round(self.share * base.steps)),
+            model=replace(
+                base.model,
+                edges=self.edges,
+                radius=None if factor == 1.0 else round(factor * radius, 6),
+            ),
+        )
+
+
+MLP = Model("mlp", "MLP", "mse", edges=False)
+MSE = Model("mse", "GNS, MSE", "mse", policies=("fixed", "knn"))
+NLL = Model("nll", "GNS, NLL", "nll", policies=POLICIES)
+TUNED = Model(
+    "tuned", "AdaptGNS, chosen rule", "nll", policies=("adaptive", "random"), weights="nll"
+)
+EARLY = tuple(
+    replace(
+        NLL,
+        name=f"nll-{percent}",
+        title=f"GNS, NLL, {percent} % of the steps",
+        share=percent / 100,
+        policies=("fixed", "adaptive", "random"),
+    )
+    for percent in (10, 30)
+)
+PAPER_MODELS = (
+    MSE,
+    NLL,
+    MLP,
+    *EARLY,
+    replace(MSE, name="mse-denser", title="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)),
+    replace(NLL, name="nll-middle", title="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)),
+    replace(
+        NLL,
+        name="nll-adaptive",
+        title="AdaptGNS, trained on adaptive graphs",
+        graph="adaptive",
+        policies=("fixed", "adaptive", "random"),
+    ),
+    replace(NLL, name="beta-nll", title="GNS, beta-NLL", loss="beta-nll"),
+    replace(
+        MSE, name="mse-matched", title="GNS, MSE, matched r", radius="matched", policies=("fixed",)
+    ),
+    TUNED,
+)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The rules among which one is chosen on validation."""
+
+    tau: tuple[float, ...] = (50.0, 70.0, 90.0)
+    factor: tuple[float, ...] = (1.1, 1.267, 1.5)
+    radius: tuple[float, ...] = (0.85, 0.925, 1.0)
+    """Times that of the data"""
+    trajectories: int | None = None
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Which models are run, and how large everything is."""
+
+    base: TrainConfig
+    models: tuple[Model, ...]
+    seeds: tuple[int, ...]
+    marks: tuple[int, ...]
+    """Steps at which errors are reported; the last one is that of the conclusions"""
+    trajectories: int | None = None
+    """Test trajectories rolled out; None: all"""
+    horizon: int | None = None
+    """Frames of the rollouts; None: to the end"""
+    sweep: Sweep = Sweep()
+    gate: float | None = None
+    """Edges on predicted over those on true positions that the fixed graph's baseline must come
+    within at the last mark on validation; its training is doubled until then"""
+    gate_steps: int = 0
+    """Training steps past which it is not doubled again"""
+    plans: Mapping[str, Mapping[str, SplitPlan]] = field(default_factory=dict)
+    """Data sets that are generated for this profile instead of the embedded ones"""
+
+
+PROFILES: dict[ProfileName, Profile] = {
+    "smoke": Profile(
+        base=replace(PRESETS["smoke"], steps=12, validate_every=12, validate_horizon=5),
+        models=(MSE, NLL, MLP, EARLY[1], TUNED),
+        sweep=Sweep(tau=(70.0,), factor=(1.1, 1.267), radius=(0.9, 1.0)),
+        seeds=(0, 1),
+        marks=(5, 10),
+        horizon=10,
+        plans={
+            scene: {
+                "train": SplitPlan(scene, 2, frames=24, particles=(30, 50)),
+                "valid": SplitPlan(scene, 1, frames=24, particles=(30, 50)),
+                "test": SplitPlan(scene, 2, frames=24, particles=(30, 50)),
+            }
+            for scene in ("waterdrop", "sand")
+        },
+    ),
+    "laptop": Profile(
+        base=PRESETS["laptop"],
+        models=(MSE, NLL, MLP, *EARLY, TUNED),
+        sweep=Sweep(trajectories=5),
+        seeds=(0, 1, 2),
+        marks=(50, 100, 200),
+        trajectories=10,
+        horizon=200,
+    ),
+    "full": Profile(
+        base=replace(PRESETS["laptop"], steps=120_000, validate_every=10_000, validate_horizon=200),
+        models=PAPER_MODELS,
+        seeds=(0, 1, 2),
+        marks=(50, 100, 200),
+        gate=1.2,
+        gate_steps=2_000_000,
+        plans={
+            "waterdrop": {
+                "train": SplitPlan("waterdrop", 400, frames=300, particles=(40, 200)),
+                "valid": SplitPlan("waterdrop", 10, frames=400),
+                "test": SplitPlan("waterdrop", 30, frames=1000),
+            },
+        },
+    ),
+    "paper": Profile(
+        base=PRESETS["paper"],
+        models=PAPER_MODELS,
+        seeds=(0, 1, 2),
+        marks=(50, 100, 200),
+        plans={
+            "waterdrop": {
+                "train": SplitPlan("waterdrop", 1000, frames=1000),
+                "valid": SplitPlan("waterdrop", 30, frames=1000),
+                "test": SplitPlan("waterdrop", 30, frames=1000),
+            },
+            "sand": {
+                "train": SplitPlan("sand", 1000, frames=320),
+                "valid": SplitPlan("sand", 100, frames=320),
+                "test": SplitPlan("sand", 30, frames=320),
+            },
+        },
+    ),
+}

@@ -1,0 +1,509 @@
+"""The runs of a study: what each is, where its files lie, and how it is made.
+
+A run trains one model with one seed on one data set, rolls it out under each of the model's
+policies, and measures that. Files in the study's folder:
+
+- ``training/DATA/MODEL-SEED/``: what ``train`` writes; an interrupted run goes on from there
+- ``metrics/DATA/MODEL-SEED-POLICY.json``: what the report is made of, with its configuration
+- ``metrics/DATA/MODEL-SEED-adaptive.npz``: frames of its first trajectory, of one seed, for figures
+- ``metrics/DATA/data.json``: what the data are like; ``gate.json``: how long it had to be trained;
+  ``sweep/``: the rules that were tried on validation; ``times.json``: milliseconds of a step
+- ``data/``: data sets that are generated for a profile
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from adaptgns.atomic import write_json, written_whole
+from adaptgns.checkpoint import LAST, read_checkpoint
+from adaptgns.config import (
+    HISTORY,
+    AdaptiveConfig,
+    Device,
+    PolicyName,
+    RolloutConfig,
+    TrainConfig,
+    from_json,
+    to_json,
+    torch_device,
+)
+from adaptgns.data.default import EMBEDDED, dataset_folder
+from adaptgns.data.generation import generate_dataset
+from adaptgns.data.metadata import Metadata, read_metadata
+from adaptgns.data.trajectories import open_split
+from adaptgns.evaluate import STATISTICS_STEP, measure
+from adaptgns.graph_statistics import graph_statistics
+from adaptgns.policies import make_policy
+from adaptgns.processes import ALONE
+from adaptgns.reproduce.profiles import ADAPTIVE, DENSER, MSE, NLL, Model, Profile, ProfileName
+from adaptgns.rollout import Step, steps, write_rollouts
+from adaptgns.rollout_file import RolloutFile
+from adaptgns.sweep import RESULT, SweepConfig, sweep
+from adaptgns.train import train
+
+SNAPSHOTS = (1, 10, 50, 100)
+"""Steps whose frames are kept for the figures"""
+EVERY = 10
+"""Steps between those of the statistics' evolution"""
+TIMED = 40
+"""Steps that are timed"""
+DRAWN = (NLL.name, "adaptive")
+"""Model and policy whose frames the figures show, of the first seed"""
+LOCAL = {
+    *("out", "checkpoint", "data", "resume", "preset", "device", "threads", "workers"),
+    *("checkpoint_every", "test_trajectories", "test_horizon"),
+}
+"""Settings that say where and how a run was made, not what it is"""
+
+
+class StudyError(ValueError):
+    """A run that is missing, or is not what the study would make."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """All runs of a profile on some data sets."""
+
+    preset: ProfileName
+    profile: Profile
+    data: tuple[str, ...]
+    """Embedded sets' names, or folders"""
+    out: Path
+    device: Device = "auto"
+    threads: int | None = None
+
+    @cached_property
+    def sets(self) -> dict[str, DataSet]:
+        """By name, in order."""
+        sets = {Path(data).name: DataSet(self, data) for data in self.data}
+        if len(sets) < len(self.data):
+            raise StudyError(f"data: got {', '.join(self.data)}, two of one name; rename one")
+        return sets
+
+    def runs(self) -> Iterator[Run]:
+        """The most telling first: one seed of everything, then the next; what depends on other
+        runs last."""
+        for depends in (False, True):
+            for seed in self.profile.seeds:
+                for data in self.sets.values():
+                    for model in self.profile.models:
+                        if model.depends == depends:
+                            yield Run(data, model, seed)
+
+    @property
+    def last_mark(self) -> int:
+        """The step of the conclusions."""
+        return self.profile.marks[-1]
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A data set of the study."""
+
+    study: Study
+    source: str
+
+    @property
+    def name(self) -> str:
+        """That of its folder, or the embedded set's."""
+        return Path(self.source).name
+
+    @property
+    def metrics(self) -> Path:
+        """The folder of what was measured on it."""
+        return self.study.out / "metrics" / self.name
+
+    @cached_property
+    def folder(self) -> Path:
+        """Where the data are, which are made where the profile has its own."""
+        plans = self.study.profile.plans.get(self.source)
+        if plans is None or self.source not in EMBEDDED:
+            return dataset_folder(self.source)
+        folder = self.study.out / "data" / self.name
+        generate_dataset(folder, plans, console=Console(stderr=True, quiet=folder.exists()))
+        return folder
+
+    @cached_property
+    def metadata(self) -> Metadata:
+        """Of the data."""
+        return read_metadata(self.folder)
+
+    def describe(self) -> None:
+        """Measure the true graphs, for table 2, and what the policy knn takes its k from."""
+        path = self.metrics / "data.json"
+        if path.exists():
+            return
+        metadata, evolution, statistics = self.metadata, [], []
+        test = open_split(self.folder, "test")
+        shortest = min(int(test.lengths.min()) - HISTORY, STATISTICS_STEP)
+        for trajectory in test:
+            frames = trajectory.positions[HISTORY - 1 :]
+            statistics.append(
+                asdict(graph_statistics(frames[shortest], metadata.radius, metadata.box))
+            )
+            evolution.append(
+                [
+                    asdict(graph_statistics(frame, metadata.radius, metadata.box))
+                    for frame in frames[::EVERY]
+                ]
+            )
+        valid = open_split(self.folder, "valid")
+        degrees = [
+            graph_statistics(
+                trajectory.positions[HISTORY - 1 :: EVERY][step], metadata.radius, metadata.box
+            ).degree
+            for trajectory in valid
+            for step in range(len(trajectory.positions[HISTORY - 1 :: EVERY]))
+        ]
+        write_json(
+            path,
+            {
+                "radius": metadata.radius,
+                "step": shortest,
+                "statistics": statistics,
+                "evolution_every": EVERY,
+                "evolution": evolution,
+                "valid_degree": float(np.mean(degrees)),
+            },
+        )
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What :meth:`describe` wrote."""
+        return read_json(self.metrics / "data.json")
+
+    @property
+    def steps(self) -> int:
+        """Training steps of a full run: the profile's, or those that the gate asked for."""
+        path = self.metrics / "gate.json"
+        if self.study.profile.gate is None or not path.exists():
+            return self.study.profile.base.steps
+        return int(read_json(path)["steps"])
+
+    @property
+    def rule(self) -> dict[str, float]:
+        """What the sweep chose."""
+        chosen: dict[str, float] = read_json(self.metrics / "sweep" / RESULT)["chosen"]
+        return chosen
+
+    def choose_rule(self, console: Console) -> None:
+        """Sweep the adaptive rule on validation, with the NLL model of the first seed, within the
+        edges that the fixed graph of the MSE model has there."""
+        folder = self.metrics / "sweep"
+        if (folder / RESULT).exists():
+            return
+        profile, radius = self.study.profile, float(self.described["radius"])
+        seed = profile.seeds[0]
+        run = Run(self, NLL, seed)
+        run.require_training()
+        budget = valid_edges(self, MSE, seed, "fixed")
+        sweep(
+            SweepConfig(
+                checkpoint=run.folder,
+                out=folder,
+                data=str(self.folder),
+                tau=profile.sweep.tau,
+                factor=profile.sweep.factor,
+                radius=tuple(round(share * radius, 6) for share in profile.sweep.radius),
+                edges=budget,
+                steps=self.study.last_mark,
+                trajectories=profile.sweep.trajectories,
+                device=self.study.device,
+            ),
+            console,
+        )
+
+    def time_steps(self, runs: Sequence[Run]) -> None:
+        """Time a step under every model and policy in ``runs``, in turns, on true positions of one
+        test trajectory."""
+        path = self.metrics / "times.json"
+        if path.exists():
+            return
+        trajectory = open_split(self.folder, "test")[0]
+        start = max(0, min(STATISTICS_STEP, len(trajectory.positions) - HISTORY - TIMED))
+        trajectory = replace(trajectory, positions=trajectory.positions[start:])
+        count = min(TIMED, len(trajectory.positions) - HISTORY)
+        rolling: dict[str, Iterator[Step]] = {}
+        for run in runs:
+            simulator = read_checkpoint(run.folder).simulator()
+            simulator = simulator.to(torch_device(self.study.device))
+            for policy in run.model.policies:
+                config = run.rollout_config(policy)
+                rolling[f"{run.model.name}, {policy}"] = steps(
+                    simulator,
+                    trajectory,
+                    make_policy(policy, config.adaptive, k=config.k, seed=config.seed),
+                    count,
+                    radius=config.radius,
+                    teacher_forcing=True,
+                )
+        times: dict[str, list[Step]] = {name: [] for name in rolling}
+        for _ in range(count):
+            for name, each in rolling.items():
+                times[name].append(next(each))
+        write_json(
+            path,
+            {
+                name: {
+                    kind: float(np.median([getattr(step, kind) for step in taken]))
+                    for kind in ("graph_ms", "model_ms", "edges")
+                }
+                for name, taken in times.items()
+            },
+        )
+
+    @property
+    def times(self) -> dict[str, dict[str, float]]:
+        """What :meth:`time_steps` measured."""
+        return read_json(self.metrics / "times.json")
+
+    def pass_gate(self, console: Console) -> None:
+        """Find how long the fixed graph's baseline must train until it does not clump."""
+        profile, path = self.study.profile, self.metrics / "gate.json"
+        if profile.gate is None or path.exists():
+            return
+        steps, ratios = profile.base.steps, {}
+        while True:
+            model = replace(MSE, name=f"gate-{steps}", share=steps / profile.base.steps)
+            run = Run(self, model, profile.seeds[0])
+            run.train(console)
+            row = run.measured("fixed", split="valid", console=console)["rollouts"][0]
+            ratio = row["scalars"][f"clumping@{self.study.last_mark}"]["mean"]
+            ratios[str(steps)] = ratio
+            passed = ratio is not None and ratio <= profile.gate
+            if passed or 2 * steps > profile.gate_steps:
+                break
+            steps *= 2
+        write_json(path, {"steps": steps, "ratios": ratios, "wanted": profile.gate})
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training and its rollouts."""
+
+    data: DataSet
+    model: Model
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Names it in the study."""
+        return f"{self.data.name}/{self.model.name}-{self.seed}"
+
+    @property
+    def study(self) -> Study:
+        """That it is part of."""
+        return self.data.study
+
+    @property
+    def folder(self) -> Path:
+        """Of the training."""
+        return self.study.out / "training" / self.data.name / f"{self.trained.name}-{self.seed}"
+
+    @property
+    def trained(self) -> Model:
+        """The model whose training it uses, as a rule its own."""
+        if self.model.weights is None:
+            return self.model
+        return next(m for m in self.study.profile.models if m.name == self.model.weights)
+
+    def metrics(self, policy: PolicyName) -> Path:
+        """What was measured under ``policy``."""
+        return self.data.metrics / f"{self.model.name}-{self.seed}-{policy}.json"
+
+    @property
+    def done(self) -> bool:
+        """Whether everything has been measured."""
+        return all(self.metrics(policy).exists() for policy in self.model.policies)
+
+    def config(self) -> TrainConfig:
+        """Of the training. StudyError where it depends on runs that are missing."""
+        base = replace(self.study.profile.base, steps=self.data.steps, data=self.data.source)
+        radius = float(self.data.described["radius"])
+        config = self.trained.config(base, self.seed, radius)
+        if self.model.radius == "matched":
+            matched = matched_radius(self.data, self.seed, radius)
+            config = replace(config, model=replace(config.model, radius=matched))
+        return config
+
+    def rollout_config(self, policy: PolicyName) -> RolloutConfig:
+        """Of the rollouts under ``policy``."""
+        profile, rule, radius = self.study.profile, ADAPTIVE, None
+        if self.model.weights is not None:
+            chosen = self.data.rule
+            rule, radius = AdaptiveConfig(chosen["tau"], chosen["factor"]), chosen["radius"]
+        return RolloutConfig(
+            checkpoint=self.folder,
+            out=self.folder / f"{self.model.name}-{policy}.h5",
+            data=str(self.data.source),
+            policy=policy,
+            adaptive=rule,
+            radius=radius,
+            k=max(1, round(self.data.described["valid_degree"])),
+            steps=profile.horizon,
+            trajectories=profile.trajectories,
+            seed=self.seed,
+            device=self.study.device,
+        )
+
+    def do(self, console: Console) -> None:
+        """Make what is missing of it."""
+        if self.done:
+            return
+        if self.model.weights is None:
+            self.train(console)
+        else:
+            self.require_training()
+            self.data.choose_rule(console)
+        for policy in self.model.policies:
+            if self.metrics(policy).exists():
+                continue
+            drawn = (self.model.name, policy, self.seed) == (*DRAWN, self.study.profile.seeds[0])
+            content = self.measured(policy, console=console, snapshot=drawn)
+            write_json(self.metrics(policy), content)
+
+    def require_training(self) -> None:
+        """Raise StudyError where what it builds on has not been trained."""
+        if not (self.folder / LAST).exists():
+            raise StudyError(
+                f"{self.name}: needs {self.data.name}/{self.trained.name}-{self.seed}, which is "
+                "missing"
+            )
+
+    def train(self, console: Console) -> None:
+        """Train to the end, from where it was left."""
+        config = replace(
+            self.config(),
+            data=str(self.data.folder),
+            out=self.folder,
+            device=self.study.device,
+            threads=self.study.threads,
+        )
+        last = self.folder / LAST
+        if last.exists():
+            checkpoint = read_checkpoint(last)
+            refuse_difference(str(last), to_json(checkpoint.config), to_json(config))
+            if checkpoint.step == config.steps:
+                return
+            config = replace(config, resume=self.folder)
+        console.print(f"{self.name}: training", highlight=False)
+        train(config, console, ALONE)
+
+    def measured(
+        self,
+        policy: PolicyName,
+        *,
+        console: Console,
+        split: str = "test",
+        snapshot: bool = False,
+    ) -> dict[str, Any]:
+        """Roll out under ``policy``, and measure; the report as JSON, of which nothing tells where
+        it was made."""
+        values = {**to_json(self.rollout_config(policy)), "split": split}
+        values["data"] = str(self.data.folder)
+        config = from_json(RolloutConfig, values, source=self.name)
+        console.print(f"{self.name}: {split}, {policy}", highlight=False)
+        write_rollouts(config, console)
+        content = measure([config.out], self.study.profile.marks).to_json()
+        if snapshot:
+            write_snapshot(config.out, self.metrics(policy).with_suffix(".npz"))
+        config.out.unlink()
+        del content["baselines"]  # the same for every run
+        for row in content["rollouts"]:
+            row["file"] = None
+            for settings in (row["settings"], row["settings"]["training"]):
+                for name in ("out", "checkpoint", "resume"):
+                    settings.pop(name, None)
+                settings["data"] = self.data.name
+        return content
+
+    def read(self, policy: PolicyName) -> dict[str, Any]:
+        """The row of metrics of the test split under ``policy``.
+
+        StudyError where it is missing, or its configuration is not that of this run.
+        """
+        path = self.metrics(policy)
+        if not path.exists():
+            raise StudyError(
+                f"{path}: missing; run `python -m adaptgns.reproduce --preset {self.study.preset} "
+                f"--only '{self.name}'`"
+            )
+        row: dict[str, Any] = read_json(path)["rollouts"][0]
+        refuse_difference(str(path), row["settings"]["training"], to_json(self.config()))
+        refuse_difference(str(path), row["settings"], to_json(self.rollout_config(policy)))
+        return row
+
+
+def matched_radius(data: DataSet, seed: int, radius: float) -> float:
+    """The radius of the fixed graph that has as many edges as the adaptive one in rollouts of the
+    validation split, interpolated in the radius squared between two models' rollouts."""
+    denser = next((m for m in data.study.profile.models if m.radius == DENSER), None)
+    if denser is None:
+        raise StudyError("mse-matched: the profile has no model with the denser graph")
+    sparse = valid_edges(data, MSE, seed, "fixed")
+    dense = valid_edges(data, denser, seed, "fixed")
+    adaptive = valid_edges(data, NLL, seed, "adaptive")
+    share = (adaptive - sparse) / (dense - sparse) if dense != sparse else 0.0
+    squared = radius**2 * (1 + min(max(share, 0.0), 1.0) * (DENSER**2 - 1))
+    return round(math.sqrt(squared), 6)
+
+
+def valid_edges(data: DataSet, model: Model, seed: int, policy: PolicyName) -> float:
+    """Edges per step of a model's rollouts of the validation split, which are made once."""
+    run = Run(data, model, seed)
+    path = data.metrics / f"{model.name}-{seed}-{policy}-valid.json"
+    if not path.exists():
+        run.require_training()
+        write_json(path, run.measured(policy, split="valid", console=Console(quiet=True)))
+    return float(read_json(path)["rollouts"][0]["scalars"]["edges_per_step"]["mean"])
+
+
+def refuse_difference(path: str, made: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Raise StudyError where two configurations differ in more than where and how they ran."""
+    for name, value in wanted.items():
+        if name not in LOCAL and made.get(name, value) != value:
+            raise StudyError(
+                f"{path}: was made with {name} {made[name]}; the study has {value}. Remove it, or "
+                "give another --out"
+            )
+
+
+def write_snapshot(rollouts: Path, path: Path) -> None:
+    """Keep frames of the first trajectory in ``rollouts``: positions ``[S, N, d]`` and sigma
+    ``[S, N]`` after the steps ``[S]``."""
+    with RolloutFile(rollouts) as file:
+        rollout = file[0]
+        steps = [step for step in SNAPSHOTS if step <= rollout.steps]
+        rows = [step - 1 for step in steps]
+        arrays = {
+            "steps": np.array(steps),
+            "predicted": rollout.predicted[rows],
+            "true": rollout.true[rows],
+        }
+        sigma = rollout.sigma
+        if sigma is not None:
+            arrays["sigma"] = sigma[rows]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial, partial.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """What :func:`~adaptgns.atomic.write_json` wrote; StudyError where there is nothing."""
+    try:
+        content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        raise StudyError(f"{path}: missing; `python -m adaptgns.reproduce` writes it") from None
+    except ValueError as error:
+        raise StudyError(f"{path}: not readable as JSON: {error}") from None
+    return content

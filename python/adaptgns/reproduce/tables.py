@@ -1,0 +1,425 @@
+"""The tables of a study's report, each row with the metrics that it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adaptgns.config import PolicyName
+from adaptgns.reproduce.results import Estimate, Results, Series
+from adaptgns.reproduce.runs import EVERY, DataSet, read_json
+from adaptgns.sweep import RESULT
+
+MISSING = "–"
+PAPER_STATISTICS = {
+    "waterdrop": ("567 ± 200", "1,550 ± 583", "1.08e-02", "5.42 ± 0.22", "0.494 ± 0.036"),
+    "sand": ("1,270 ± 503", "4,324 ± 1,864", "7.35e-03", "6.76 ± 1.01", "0.500 ± 0.034"),
+}
+PAPER_RESULTS = {
+    "sand": {
+        "MLP": ("N/A", "0.121"),
+        "MSE, r 0.015": ("18,682", "0.0434"),
+        "MSE, r 0.0176": ("23,498", "0.0355"),
+        "MSE, r 0.019": ("25,516", "0.0285"),
+        "NLL, r 0.015": ("28,968", "0.0417"),
+        "NLL, r 0.0176": ("28,768", "0.0422"),
+        "AdaptGNS": ("22,958", "0.0382"),
+    },
+    "waterdrop": {
+        "MLP": ("N/A", "0.207"),
+        "MSE, r 0.015": ("9,741", "0.0414"),
+        "MSE, r 0.019": ("12,212", "0.0388"),
+        "NLL, r 0.015": ("7,875", "0.0417"),
+        "AdaptGNS": ("7,821", "0.0412"),
+    },
+}
+"""Edges per step and MSE@200, measured on other data"""
+
+Comparison = tuple[str, tuple[str, PolicyName], tuple[str, PolicyName]]
+COMPARISONS: tuple[Comparison, ...] = (
+    ("adaptive or fixed graph, same model", ("nll", "adaptive"), ("nll", "fixed")),
+    ("uncertain or random particles expanded", ("nll", "adaptive"), ("nll", "random")),
+    ("sigma of the step before or of this one", ("nll", "adaptive"), ("nll", "two-pass")),
+    ("adaptive NLL or fixed MSE: the aim", ("nll", "adaptive"), ("mse", "fixed")),
+    ("the chosen rule or fixed MSE: the aim", ("tuned", "adaptive"), ("mse", "fixed")),
+    ("the chosen rule or fixed, same model", ("tuned", "adaptive"), ("nll", "fixed")),
+    ("the chosen rule, uncertain or random", ("tuned", "adaptive"), ("tuned", "random")),
+    ("NLL or MSE, fixed graphs", ("nll", "fixed"), ("mse", "fixed")),
+    ("k nearest or all within r, NLL", ("nll", "knn"), ("nll", "fixed")),
+    ("k nearest or all within r, MSE", ("mse", "knn"), ("mse", "fixed")),
+    ("GNS or MLP", ("mse", "fixed"), ("mlp", "fixed")),
+    ("r 0.019 or 0.015, MSE", ("mse-denser", "fixed"), ("mse", "fixed")),
+    ("adaptive NLL or MSE at matched edges", ("nll", "adaptive"), ("mse-matched", "fixed")),
+    ("adaptive or r 0.0176, NLL", ("nll", "adaptive"), ("nll-middle", "fixed")),
+    (
+        "trained on adaptive or base graphs, adaptive",
+        ("nll-adaptive", "adaptive"),
+        ("nll", "adaptive"),
+    ),
+    (
+        "adaptive or fixed, trained on adaptive graphs",
+        ("nll-adaptive", "adaptive"),
+        ("nll-adaptive", "fixed"),
+    ),
+    ("adaptive beta-NLL or fixed MSE", ("beta-nll", "adaptive"), ("mse", "fixed")),
+    ("adaptive or fixed, beta-NLL", ("beta-nll", "adaptive"), ("beta-nll", "fixed")),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Cells of a row, and the files that its numbers come from."""
+
+    cells: Sequence[str]
+    files: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the report."""
+
+    name: str
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Row]
+    note: str = ""
+
+
+def tables(results: Results) -> list[Table]:
+    """All that the study's profile has the runs for."""
+    made = [_statistics(results)]
+    for data in results.study.sets.values():
+        made += [
+            _rollouts(results, data),
+            _comparisons(results, data),
+            _clouds(results, data),
+            _sweep(results, data),
+            *([_along(results, data)] if len(_shares(results, data)) > 1 else []),
+            *_calibration(results, data),
+        ]
+    return [*made, *_paper(results)]
+
+
+def _statistics(results: Results) -> Table:
+    rows = []
+    step = 0
+    for data in results.study.sets.values():
+        described = data.described
+        step = described["step"]
+        values = {
+            name: np.array([each[name] for each in described["statistics"]])
+            for name in ("nodes", "edges", "density", "degree", "clustering")
+        }
+        rows.append(
+            Row(
+                [
+                    data.name,
+                    str(len(described["statistics"])),
+                    *(_mean_std(values[name], ",.0f") for name in ("nodes", "edges")),
+                    f"{values['density'].mean():.2e}",
+                    _mean_std(values["degree"], ".2f"),
+                    _mean_std(values["clustering"], ".3f"),
+                ],
+                [str((data.metrics / "data.json").relative_to(results.study.out).as_posix())],
+            )
+        )
+        if data.name in PAPER_STATISTICS:
+            rows.append(Row([f"{data.name}, paper's set", "30", *PAPER_STATISTICS[data.name]]))
+    return Table(
+        "statistics",
+        f"Graph statistics at step {step} (table 2)",
+        ("data", "trajectories", "nodes", "edges", "density", "degree", "clustering"),
+        rows,
+        f"Undirected edges within the data's radius, mean ± standard deviation over the test "
+        f"trajectories. Their course, every {EVERY} steps, is in the figure.",
+    )
+
+
+def _rollouts(results: Results, data: DataSet) -> Table:
+    mark = results.study.last_mark
+    rows, times = [], data.times
+    where = str((data.metrics / "times.json").relative_to(results.study.out).as_posix())
+    for series in results.of(data.name):
+        time = times[f"{series.model.name}, {series.policy}"]
+        true = series.curve("edges_within_radius_true").mean()
+        predicted = series.curve("edges_within_radius").mean()
+        rows.append(
+            Row(
+                [
+                    series.model.title,
+                    series.policy if series.model.edges else MISSING,
+                    _interval(series.estimate(f"mse@{mark}"), ".2e"),
+                    _interval(series.estimate("edges_per_step"), ",.0f")
+                    if series.model.edges
+                    else "0",
+                    f"{predicted:,.0f}",
+                    f"{true:,.0f}",
+                    f"{predicted / true:.2f}",
+                    _interval(series.estimate(f"clumping@{mark}"), ".2f"),
+                    f"{time['graph_ms']:.2f}",
+                    f"{time['model_ms']:.2f}",
+                ],
+                [*series.files, where],
+            )
+        )
+    return Table(
+        f"rollouts-{data.name}",
+        f"Rollouts on {data.name} (table 4)",
+        (
+            "model",
+            "graph",
+            f"MSE@{mark}",
+            "edges a step",
+            "edges within r, predicted",
+            "true",
+            "ratio",
+            f"ratio@{mark}",
+            "graph ms",
+            "model ms",
+        ),
+        rows,
+        "Means over seeds and trajectories, in brackets the 95 % interval of a bootstrap over "
+        "both. Edges are directed and without self-edges. The ratio is that of edges within the "
+        "data's radius on predicted over true positions: above 1, the predicted particles clump. "
+        "Milliseconds of a step are medians of all models and policies in turns, on the same true "
+        "positions.",
+    )
+
+
+def _comparisons(results: Results, data: DataSet) -> Table:
+    mark = results.study.last_mark
+    rows = []
+    for question, first, second in COMPARISONS:
+        one, other = (results.find(data.name, *which) for which in (first, second))
+        if one is None or other is None:
+            continue
+        error = results.difference(one, other, f"mse@{mark}")
+        edges = results.difference(one, other, "edges_per_step")
+        rows.append(
+            Row(
+                [
+                    question,
+                    f"{first[0]}, {first[1]}",
+                    f"{second[0]}, {second[1]}",
+                    _interval(error, "+.2e"),
+                    _relative(error, other.scalar(f"mse@{mark}").mean()),
+                    _interval(edges, "+,.0f"),
+                    _verdict(error, edges),
+                ],
+                [*one.files, *other.files],
+            )
+        )
+    return Table(
+        f"comparisons-{data.name}",
+        f"Which is better on {data.name}",
+        (
+            "question",
+            "one",
+            "other",
+            f"MSE@{mark}: one - other",
+            "of the other's",
+            "edges a step",
+            "shown",
+        ),
+        rows,
+        "Differences are paired by seed and trajectory; in brackets their 95 % interval. "
+        "Something is shown where the interval excludes zero.",
+    )
+
+
+def _clouds(results: Results, data: DataSet) -> Table:
+    marks = results.study.profile.marks
+    rows = [
+        Row(
+            [
+                series.model.title,
+                series.policy if series.model.edges else MISSING,
+                _interval(series.estimate("kinetic_energy_error"), ".3f"),
+                *(_interval(series.estimate(f"transport@{mark}"), ".1e") for mark in marks),
+            ],
+            series.files,
+        )
+        for series in results.of(data.name)
+    ]
+    return Table(
+        f"clouds-{data.name}",
+        f"Energy and where the matter is, {data.name}",
+        ("model", "graph", "kinetic energy error", *(f"transport@{mark}" for mark in marks)),
+        rows,
+        "Kinetic energy: root of the mean squared error over the steps, relative to that of the "
+        "truth. Transport: squared earth mover's distance between predicted and true particles "
+        "(length²), which Sinkhorn's algorithm approximates, here exact.",
+    )
+
+
+def _sweep(results: Results, data: DataSet) -> Table:
+    path = data.metrics / "sweep" / RESULT
+    content = read_json(path)
+    file = str(path.relative_to(results.study.out).as_posix())
+    settings, chosen = content["settings"], content["chosen"]
+    rows = [
+        Row(
+            [
+                *(f"{row[name]:g}" for name in ("tau", "factor", "radius")),
+                f"{row['mse']:.2e}",
+                f"{row['edges']:,.0f}",
+                f"{row['clumping']:.2f}",
+                "yes" if row == chosen else "",
+            ],
+            [file],
+        )
+        for row in content["trials"]
+    ]
+    return Table(
+        f"sweep-{data.name}",
+        f"The adaptive rule on validation, {data.name}",
+        (
+            "tau",
+            "factor",
+            "r",
+            f"MSE@{settings['steps']}",
+            "edges a step",
+            f"ratio@{settings['steps']}",
+            "chosen",
+        ),
+        rows,
+        f"One seed. The budget is that of the fixed MSE model there, {settings['edges']:,.0f} "
+        "directed edges a step.",
+    )
+
+
+def _shares(results: Results, data: DataSet) -> list[tuple[float, str]]:
+    """Shares of the training at which the NLL model was measured, and the models' names."""
+    return sorted(
+        (series.model.share, series.model.name)
+        for series in results.of(data.name)
+        if (series.model.name == "nll" or series.model.name.startswith("nll-"))
+        and series.model.graph == "base"
+        and series.model.radius == 1.0
+        and series.policy == "adaptive"
+    )
+
+
+def _along(results: Results, data: DataSet) -> Table:
+    mark = results.study.last_mark
+    rows = []
+    for share, name in _shares(results, data):
+        fixed, adaptive = (
+            results.series[data.name, name, policy] for policy in ("fixed", "adaptive")
+        )
+        error = results.difference(adaptive, fixed, f"mse@{mark}")
+        edges = results.difference(adaptive, fixed, "edges_per_step")
+        rows.append(
+            Row(
+                [
+                    f"{share:.0%} of {data.steps:,}",
+                    _interval(fixed.estimate(f"mse@{mark}"), ".2e"),
+                    _interval(fixed.estimate(f"clumping@{mark}"), ".2f"),
+                    _interval(error, "+.2e"),
+                    _relative(error, fixed.scalar(f"mse@{mark}").mean()),
+                    _interval(edges, "+,.0f"),
+                ],
+                [*fixed.files, *adaptive.files],
+            )
+        )
+    return Table(
+        f"along-{data.name}",
+        f"Does the gain last as the model gets better? {data.name}",
+        (
+            "training steps",
+            f"MSE@{mark}, fixed",
+            f"ratio@{mark}, fixed",
+            "adaptive - fixed",
+            "of fixed",
+            "edges a step",
+        ),
+        rows,
+        "Each row's models were trained from the start with a schedule of that length.",
+    )
+
+
+def _calibration(results: Results, data: DataSet) -> list[Table]:
+    made = []
+    for series in results.of(data.name):
+        if series.policy != "fixed" or series.model.share < 1:
+            continue
+        errors, predicted, gaps = (
+            series.calibration(name) for name in ("squared_error", "predicted", "gap")
+        )
+        if not len(errors):
+            continue
+        ranks = np.array([row["spearman"] for row in series.rows], dtype=np.float64)
+        rows = [
+            Row(
+                [str(index), f"{error:.4g}", f"{variance:.4g}", f"{gap:.4g}"],
+                series.files,
+            )
+            for index, (error, variance, gap) in enumerate(
+                zip(errors.mean(0), predicted.mean(0), gaps.mean(0), strict=True)
+            )
+        ]
+        rows.append(Row(["ECE", "", "", f"{gaps.mean():.4g}"], series.files))
+        made.append(
+            Table(
+                f"calibration-{data.name}-{series.model.name}",
+                f"Calibration of {series.model.title} on {data.name} (table 3)",
+                ("decile of sigma", "mean squared error", "d·σ²", "|Δ|"),
+                rows,
+                "One step from true positions, normalized units, deciles of each seed averaged "
+                f"over {len(errors)} seeds. Rank correlation of sigma and error "
+                f"{ranks.mean():.2f} ({ranks.min():.2f} to {ranks.max():.2f} over the seeds).",
+            )
+        )
+    return made
+
+
+def _paper(results: Results) -> list[Table]:
+    rows = [
+        Row([name, model, edges, error])
+        for name in results.study.sets
+        for model, (edges, error) in PAPER_RESULTS.get(name, {}).items()
+    ]
+    if not rows:
+        return []
+    return [
+        Table(
+            "paper",
+            "The paper's table 4, measured on other data",
+            ("data", "model", "edges a step", "MSE@200"),
+            rows,
+            "One seed; its water was made by SPH and its sand by another MPM, and its true frames "
+            "hold about 3,100 directed edges at step 100 on water: context, no comparison.",
+        )
+    ]
+
+
+def _mean_std(values: np.ndarray, form: str) -> str:
+    return f"{values.mean():{form}} ± {values.std():{form}}"
+
+
+def _interval(value: Estimate, form: str) -> str:
+    if not np.isfinite(value.mean):
+        return MISSING
+    return f"{value.mean:{form}} [{value.low:{form}}, {value.high:{form}}]"
+
+
+def _relative(difference: Estimate, reference: float) -> str:
+    if not (np.isfinite(difference.mean) and reference):
+        return MISSING
+    return f"{difference.mean / reference:+.0%}"
+
+
+def _verdict(error: Estimate, edges: Estimate) -> str:
+    said = [
+        f"{'lower' if value.mean < 0 else 'higher'} {what}"
+        for what, value in (("error", error), ("edges", edges))
+        if value.shown
+    ]
+    return ", ".join(said) or "nothing"
+
+
+def series_label(series: Series) -> str:
+    """Names a model under a policy in a figure."""
+    return f"{series.model.title}, {series.policy}" if series.model.edges else series.model.title

@@ -1,0 +1,103 @@
+"""The search over the adaptive rule: every combination, once, resumed, within the budget."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from adaptgns.sweep import RESULT, SweepConfig, main, sweep
+from adaptgns.train import main as train
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def run(drops: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model with a variance, hardly trained."""
+    out = tmp_path_factory.mktemp("run") / "nll"
+    train(["--preset", "smoke", "--data", str(drops), "--out", str(out), "--steps", "5"])
+    return out
+
+
+@pytest.fixture
+def config(run: Path, tmp_path: Path) -> SweepConfig:
+    return SweepConfig(
+        checkpoint=run,
+        out=tmp_path / "sweep",
+        tau=(60.0, 90.0),
+        factor=(1.2,),
+        radius=(0.012, 0.015),
+        steps=6,
+        device="cpu",
+    )
+
+
+def test_the_grid_is_taken_whole_and_once(config: SweepConfig) -> None:
+    result = sweep(config, QUIET)
+    found = {(row["tau"], row["factor"], row["radius"]) for row in result["trials"]}
+    assert found == {(t, 1.2, r) for t in (60, 90) for r in (0.012, 0.015)}
+    assert len(result["trials"]) == 4
+    errors = [row["mse"] for row in result["trials"]]
+    assert errors == sorted(errors)
+    assert result["chosen"]["mse"] == errors[0]
+    # More particles that see farther, and larger radii, have more edges.
+    edges = {(row["tau"], row["radius"]): row["edges"] for row in result["trials"]}
+    assert edges[60, 0.015] > edges[90, 0.015] > edges[90, 0.012]
+    assert json.loads((config.out / RESULT).read_text())["chosen"]["tau"] in (60, 90)
+    assert (config.out / "sweep.png").stat().st_size > 1000
+    assert (config.out / "sweep.pdf").exists()
+
+
+def test_what_was_tried_is_not_tried_again(
+    config: SweepConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = sweep(replace(config, trials=3), QUIET)
+    assert len(first["trials"]) == 3
+    second = sweep(config, QUIET)
+    assert len(second["trials"]) == 4
+    assert all(row in second["trials"] for row in first["trials"])
+    monkeypatch.setattr("adaptgns.sweep.measure", None)  # nothing is left to measure
+    assert sweep(config, QUIET)["trials"] == second["trials"]
+    with pytest.raises(ValueError, match="holds trials with other steps"):
+        sweep(replace(config, steps=4), QUIET)
+
+
+def test_the_budget_of_edges_holds(config: SweepConfig) -> None:
+    every = sweep(config, QUIET)["trials"]
+    budget = sorted(row["edges"] for row in every)[1]
+    chosen = sweep(replace(config, edges=budget), QUIET)["chosen"]
+    within = [row for row in every if row["edges"] <= budget]
+    assert chosen["mse"] == min(row["mse"] for row in within)
+    with pytest.raises(ValueError, match="no trial is within 1 edges a step, the thriftiest has"):
+        sweep(replace(config, edges=1.0), QUIET)
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "random"])
+def test_samplers_that_draw_stay_within_the_ranges(config: SweepConfig, sampler: str) -> None:
+    drawn = replace(config, sampler=sampler, trials=3, factor=(1.1, 1.5), edges=1e6)
+    trials = sweep(drawn, QUIET)["trials"]
+    assert len(trials) == 3
+    for row in trials:
+        assert 60 <= row["tau"] <= 90
+        assert 1.1 <= row["factor"] <= 1.5
+        assert 0.012 <= row["radius"] <= 0.015
+    assert len({row["factor"] for row in trials}) == 3
+
+
+def test_the_command(config: SweepConfig, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--checkpoint", str(config.checkpoint), "--out", str(config.out)]
+    main([*arguments, "--tau", "70", "--factor", "1.2", "--steps", "4"])
+    assert "chosen: tau 70, factor 1.2, radius 0.015" in capsys.readouterr().out
+    for wrong, message in (
+        (["--tau", "120"], "tau: got 120.0; accepted are numbers from 0 to 100"),
+        (["--steps", "0"], "steps: got 0; accepted are numbers above 0"),
+        (["--radius", "-1"], "radius: got (-1.0,)"),
+    ):
+        with pytest.raises(SystemExit) as left:
+            main([*arguments, *wrong])
+        assert left.value.code == 2
+        assert message in capsys.readouterr().err.replace("\n", " ")
