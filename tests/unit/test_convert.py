@@ -466,6 +466,9 @@ def test_wrong_frames_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "last.ply: no number in its name" in refusal(capsys, folder, out)
     (folder / "last.ply").rename(folder / "f_99.vtk")
     assert "frames in .ply, .vtk; one format is accepted" in refusal(capsys, folder, out)
+    (folder / "f_99.vtk").unlink()
+    path.unlink()
+    assert "frame 5 follows frame 3, elsewhere they are 1 apart" in refusal(capsys, folder, out)
     (tmp_path / "set" / "train").mkdir(parents=True)
     assert "no .vtk, .vtu, .ply files, nor folders" in refusal(
         capsys, tmp_path / "set", tmp_path / "o"
