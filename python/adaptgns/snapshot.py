@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm, to_rgba
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -64,6 +65,11 @@ def snapshot(
             axes.set(xlim=(x0, x1), ylim=(y0, y1), xticks=[], yticks=[], aspect="equal")
             axes.set_facecolor(PANEL)
             axes.spines[:].set_color(LINE)
+            if view.solid:
+                axes.add_collection(
+                    LineCollection(list(view.frame), colors=LINE, linewidths=0.8, zorder=0)
+                )
+                axes.add_collection(LineCollection(list(view.front), colors=LINE, linewidths=0.8))
             finite = np.flatnonzero(np.isfinite(course[row]).all(axis=1))
             if course is predicted and sigma is not None and scale is not None:
                 colours = SIGMA_MAP(scale(sigma[row, finite]))

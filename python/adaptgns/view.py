@@ -20,7 +20,7 @@ MARGIN = 0.02
 """Around the bounds, as a share of their longer side"""
 FARTHEST = 0.6
 """What is left of a colour in the farthest corner"""
-RIM, RIM_WIDTH = 0.5, 0.5
+RIM, RIM_WIDTH = 0.5, 0.4
 """Share of a particle's light at its rim, by which neighbours are told apart in 3D, and the rim's
 width in points"""
 
