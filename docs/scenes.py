@@ -71,6 +71,7 @@ def draw(picture: Picture, path: Path) -> None:
         points, order = view.points(trajectory.positions[frame])
         axes.add_collection(LineCollection(view.frame, colors=FRAME, linewidths=0.8))
         axes.scatter(*points[order].T, s=4, c=colours[order], linewidths=0)
+        axes.add_collection(LineCollection(view.front, colors=FRAME, linewidths=0.8))
         axes.set_xlim(view.lower[0], view.upper[0])
         axes.set_ylim(view.lower[1], view.upper[1])
         axes.set_aspect("equal")

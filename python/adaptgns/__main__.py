@@ -12,7 +12,7 @@ COMMANDS = {
     "generate": "make a data set with the embedded solver",
     "convert": "data sets and checkpoints from and to other formats",
     "inspect": "graph statistics, advice on the radius, problems of a data set",
-    "plot": "GIF, browser page or VTK series of a rollout; figures of runs",
+    "plot": "GIF, MP4, browser page or VTK series of a rollout; figures of runs",
     "sweep": "tau, factor and radius of the adaptive graph, on validation rollouts",
     "reproduce": "every table and figure of the paper, with seeds",
 }

@@ -37,7 +37,7 @@ from adaptgns.palette import (
 from adaptgns.periodic import minimum_image
 from adaptgns.rollout_file import Rollout, RolloutFile
 from adaptgns.video import write_mp4
-from adaptgns.view import View
+from adaptgns.view import View, faded
 
 WIDTH, HEIGHT, DPI = 9.6, 6.6, 100
 """Inches, and pixels per inch"""
@@ -132,8 +132,10 @@ class Animation:
         chosen = np.linspace(0, len(self.shown) - 1, PALETTE_PICTURES).round().astype(int)
         pictures = list(self.pictures(self.shown[index] for index in sorted(set(chosen))))
         ramp = np.linspace(0.0, 1.0, pictures[0].shape[1])
+        # From the nearest corner to the farthest; in 2D all is near.
+        near = np.linspace(1.0, 0.0 if self._view.solid else 1.0, RAMP_ROWS)[:, None, None]
         ramps = [
-            np.broadcast_to(colour_map(ramp, bytes=True)[:, :3], (RAMP_ROWS, len(ramp), 3))
+            np.uint8(255 * faded(colour_map(ramp), near, PANEL))[..., :3]
             for colour_map in (SPEED_MAP, SIGMA_MAP)
         ]
         sample = np.concatenate([*pictures, *ramps])
@@ -175,7 +177,8 @@ class Animation:
             scale = LogNorm(low, max(high, 1.01 * low))
             self._cloud = cloud(model, self._sigma, SIGMA_MAP, scale)
             label = "predicted σ"
-        self._moving += [*self._true_cloud.artists, *self._cloud.artists]
+        fronts = [self._front(panel) for panel in (truth, model)]
+        self._moving += [self._true_cloud.points, self._cloud.points, *fronts]
         self._scale(truth, self._true_cloud.points, "speed")
         self._scale(model, self._cloud.points, label)
         self._step = self._text(truth, 1.0, 1.02)
@@ -259,6 +262,12 @@ class Animation:
         self._moving.append(text)
         return text
 
+    def _front(self, axes: Axes) -> LineCollection:
+        """The edges of the bounds that are in front of the particles."""
+        lines = LineCollection(list(self._view.front), colors=LINE, linewidths=1.0, animated=True)
+        axes.add_collection(lines)
+        return lines
+
     def _lines(self, axes: Axes, colour: str, width: float) -> LineCollection:
         lines = LineCollection([], colors=colour, linewidths=width, animated=True)
         axes.add_collection(lines)
@@ -311,17 +320,15 @@ class Cloud:
         self.points = axes.scatter(
             [], [], s=area, c=[], cmap=colour_map, norm=scale, linewidths=0, animated=True
         )
-        self._walls = axes.scatter([], [], s=area, c=KINEMATIC, linewidths=0, animated=True)
-
-    @property
-    def artists(self) -> list[Artist]:
-        """In the order in which they are drawn."""
-        return [self._walls, self.points]
 
     def update(self, row: int, positions: Floats) -> None:
-        """Show ``positions`` ``[N, d]`` in the colours of ``row``, the nearest particle on top."""
-        points, order = self._view.points(positions)
-        mobile = order[self._mobile[order]]
-        self.points.set_offsets(points[mobile])
-        self.points.set_array(self._colours[row, mobile])
-        self._walls.set_offsets(points[order[~self._mobile[order]]])
+        """Show ``positions`` ``[N, d]`` in the colours of ``row``."""
+        colours = self.points.to_rgba(self._colours[row])
+        self._view.paint(
+            self.points,
+            positions,
+            colours,
+            self._mobile,
+            kinematic=KINEMATIC,
+            background=PANEL,
+        )

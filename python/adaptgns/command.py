@@ -6,14 +6,21 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from adaptgns.interruption import Terminated, termination
+
 
 @contextmanager
 def plain_errors(*also: type[Exception]) -> Iterator[None]:
-    """Tell wrong input, a failing disk, exhausted memory, Ctrl-C, and what is in ``also``, in one
-    line on standard error instead of a traceback, and exit: with 2, or 130 after Ctrl-C."""
+    """Tell wrong input, a failing disk, exhausted memory, Ctrl-C, SIGTERM, and what is in ``also``,
+    in one line on standard error instead of a traceback, and exit: with 2, after Ctrl-C with 130,
+    after SIGTERM with 143."""
     told: tuple[type[Exception], ...] = (ValueError, OSError, MemoryError, *also)
     try:
-        yield
+        with termination():
+            yield
+    except Terminated:
+        print("terminated", file=sys.stderr)
+        raise SystemExit(143) from None
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None

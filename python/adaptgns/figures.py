@@ -105,7 +105,7 @@ class Figures:
         for rollout, name in zip(self._rollouts, self._names, strict=True):
             style: dict[str, Any] = {
                 "color": self._colour(rollout),
-                "linestyle": DASHES[rollout.policy],
+                "linestyle": DASHES[rollout.rule],
             }
             for ax, key in ((errors, "mse"), (edges, "edges")):
                 curve = rollout.curve(key)
@@ -133,8 +133,8 @@ class Figures:
                 predicted,
                 measured,
                 color=self._colour(rollout),
-                linestyle=DASHES[rollout.policy],
-                marker=MARKERS[rollout.policy],
+                linestyle=DASHES[rollout.rule],
+                marker=MARKERS[rollout.rule],
                 markersize=3.5,
                 label=name,
             )
@@ -152,35 +152,42 @@ class Figures:
         return figure
 
     def _pareto(self) -> Figure:
-        figure, (axes,) = _figure(1, width=3.4, height=3.0)
+        """What accuracy costs: in edges, and in time."""
+        figure, panels = _figure(2)
         for rollout, name in zip(self._rollouts, self._names, strict=True):
-            edges, mse = rollout.scalar("edges_per_step"), rollout.scalar("mse")
+            mse = rollout.scalar("mse")
             error = np.std(mse, ddof=1) / np.sqrt(len(mse)) if len(mse) > 1 else 0.0
-            axes.errorbar(
-                edges.mean(),
-                mse.mean(),
-                yerr=error,
-                color=self._colour(rollout),
-                marker=MARKERS[rollout.policy],
-                linestyle="none",
-                capsize=2,
-                label=name,
-            )
-        axes.set(xlabel="directed edges of a step", title="position MSE, length²: mean ± s.e.")
-        axes.margins(0.25)
-        _logarithmic(axes)
-        legend(figure, axes)
+            milliseconds = rollout.scalar("graph_ms") + rollout.scalar("model_ms")
+            for axes, cost in zip(
+                panels, (rollout.scalar("edges_per_step"), milliseconds), strict=True
+            ):
+                axes.errorbar(
+                    cost.mean(),
+                    mse.mean(),
+                    yerr=error,
+                    color=self._colour(rollout),
+                    marker=MARKERS[rollout.rule],
+                    linestyle="none",
+                    capsize=2,
+                    label=name,
+                )
+        panels[0].set(xlabel="directed edges of a step", title="position MSE, length²: mean ± s.e.")
+        panels[1].set(xlabel="milliseconds of a step, graph and model")
+        for axes in panels:
+            axes.margins(0.25)
+            _logarithmic(axes)
+        legend(figure, panels[0])
         return figure
 
     def _colours(self) -> list[str]:
         return [SERIES[index % len(SERIES)] for index in range(len(self._runs))]
 
     def _colour(self, rollout: Evaluated) -> str:
-        """That of its run; in a report of several models, one a model."""
+        """That of its run; in a report of several models, one a model and radius."""
         if len(self._runs) > 1:
             return self._colours()[[run.name for run in self._runs].index(rollout.run)]
-        labels = list(dict.fromkeys(other.label for other in self._rollouts))
-        return SERIES[labels.index(rollout.label) % len(SERIES)]
+        models = list(dict.fromkeys((other.label, other.radius) for other in self._rollouts))
+        return SERIES[models.index((rollout.label, rollout.radius)) % len(SERIES)]
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:

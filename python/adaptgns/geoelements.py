@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from pickle import UnpicklingError
 
 import torch
 from torch import Tensor
@@ -81,9 +82,16 @@ def read_geoelements(
         simulator = Simulator(config, metadata, noise=noise, variance=False)
         simulator.load_state_dict(ours)
     except Exception as error:
+        asked = re.search(r"GLOBAL (\S+)", str(error))
+        if isinstance(error, UnpicklingError) and asked:
+            raise CheckpointError(
+                f"checkpoint {path}: refused, since it asks for the global {asked[1]}; a "
+                "state_dict of tensors alone is accepted"
+            ) from error
+        first_line = str(error).partition("\n")[0]
         raise CheckpointError(
             f"checkpoint {path}: it is not a geoelements/gns state_dict that fits the metadata "
-            f"({type(error).__name__}: {error})"
+            f"({type(error).__name__}: {first_line})"
         ) from error
     return simulator.eval()
 

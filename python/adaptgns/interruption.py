@@ -10,6 +10,30 @@ from types import FrameType
 from typing import Any
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, treated as Ctrl-C is."""
+
+
+@contextmanager
+def termination() -> Iterator[None]:
+    """SIGTERM raises :class:`Terminated`, so that what is half done is undone, as on Ctrl-C.
+
+    Threads other than the main one get no signals.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def terminate(_: int, __: FrameType | None) -> None:
+        raise Terminated
+
+    previous = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
 @contextmanager
 def interruption(*, insistent: bool = True) -> Iterator[list[str]]:
     """A list that stays empty until SIGINT or SIGTERM arrives, which then names the signal.

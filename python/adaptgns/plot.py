@@ -8,7 +8,7 @@ vtk: frames and graphs that ParaView opens.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,6 +111,12 @@ def vtk(rollout: Path, out: Path, *, trajectory: int = 0, every: int = 1) -> Non
 
 
 Config = AnimateConfig | ViewerConfig | FiguresConfig | VtkConfig
+SUBCOMMANDS: dict[str, Callable[..., Config]] = {
+    "animate": AnimateConfig,
+    "viewer": ViewerConfig,
+    "figures": FiguresConfig,
+    "vtk": VtkConfig,
+}
 
 
 def run(config: Config) -> None:
@@ -129,14 +135,7 @@ def run(config: Config) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
     config: Config = tyro.extras.subcommand_cli_from_dict(
-        {
-            "animate": AnimateConfig,
-            "viewer": ViewerConfig,
-            "figures": FiguresConfig,
-            "vtk": VtkConfig,
-        },
-        args=argv,
-        prog="python -m adaptgns.plot",
+        SUBCOMMANDS, args=argv, prog="python -m adaptgns.plot"
     )
     with plain_errors(IndexError, ImportError):
         run(config)

@@ -33,6 +33,16 @@ class Evaluated:
         """Which graph it had; empty for a baseline."""
         return self.content["policy"] or ""
 
+    @property
+    def rule(self) -> str:
+        """The policy's name, without the radius that follows where it is not that of training."""
+        return self.policy.partition(",")[0]
+
+    @property
+    def radius(self) -> str:
+        """That radius, as told; empty where it is that of training."""
+        return self.policy.partition(",")[2]
+
     def curve(self, name: str) -> NDArray[np.float64]:
         """``[K]`` values per step, NaN where they are not finite; empty where not measured."""
         return np.array(self.content["curves"].get(name, []), dtype=np.float64)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LogNorm
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm, to_rgba
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -64,16 +65,25 @@ def snapshot(
             axes.set(xlim=(x0, x1), ylim=(y0, y1), xticks=[], yticks=[], aspect="equal")
             axes.set_facecolor(PANEL)
             axes.spines[:].set_color(LINE)
+            if view.solid:
+                axes.add_collection(
+                    LineCollection(list(view.frame), colors=LINE, linewidths=0.8, zorder=0)
+                )
+                axes.add_collection(LineCollection(list(view.front), colors=LINE, linewidths=0.8))
             finite = np.flatnonzero(np.isfinite(course[row]).all(axis=1))
-            points, order = view.points(course[row, finite])
-            moves = mobile[finite[order]]
-            walls, moving = order[~moves], order[moves]
-            axes.scatter(*points[walls].T, s=AREA, c=KINEMATIC, linewidths=0)
             if course is predicted and sigma is not None and scale is not None:
-                colours = {"c": sigma[row, finite[moving]], "cmap": SIGMA_MAP, "norm": scale}
+                colours = SIGMA_MAP(scale(sigma[row, finite]))
             else:
-                colours = {"c": PREDICTED if course is predicted else TRUE}
-            axes.scatter(*points[moving].T, s=AREA, linewidths=0, **colours)
+                colour = to_rgba(PREDICTED if course is predicted else TRUE)
+                colours = np.tile(colour, (len(finite), 1))
+            view.paint(
+                axes.scatter([], [], s=AREA, linewidths=0),
+                course[row, finite],
+                colours,
+                mobile[finite],
+                kinematic=KINEMATIC,
+                background=PANEL,
+            )
             lost = len(mobile) - len(finite) + view.outside(course[row, finite])
             if lost:
                 axes.set_xlabel(f"{lost:,} out of sight", color=TEXT, fontsize=SMALL)

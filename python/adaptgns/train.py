@@ -24,7 +24,7 @@ from adaptgns.config import (
     torch_device,
 )
 from adaptgns.data.check import check_split
-from adaptgns.data.default import EMBEDDED, dataset_folder
+from adaptgns.data.default import dataset_folder
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.evaluate import evaluate
@@ -141,7 +141,7 @@ def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path
         f"{trainer.device.type}; run folder {folder}",
         highlight=False,
     )
-    if config.data not in EMBEDDED and checkpoint is None:
+    if data == Path(config.data) and checkpoint is None:
         _tell_assumptions(config, console)
     trainer.run(console)
     return folder, data

@@ -26,7 +26,7 @@ def write_mp4(
     """Write ``pictures`` ``[height, width, 3]`` to ``path``, H.264, whole or not at all.
 
     ``size`` is their width and height, both even; ``fps`` counts pictures per second. ImportError
-    without imageio-ffmpeg, OSError where encoding or writing fails.
+    without imageio-ffmpeg, OSError where it has no program or encoding or writing fails.
     """
     program = _ffmpeg()
     with written_whole(path) as partial, tempfile.TemporaryFile() as complaints:
@@ -64,5 +64,12 @@ def _ffmpeg() -> str:
             "MP4 files are encoded with imageio-ffmpeg, which is not installed: "
             "pip install 'adaptgns[video]'; a GIF needs nothing more"
         ) from None
-    program: str = imageio_ffmpeg.get_ffmpeg_exe()
+    try:
+        program: str = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError:
+        raise FileNotFoundError(
+            "MP4 files are encoded with ffmpeg, which imageio-ffmpeg doesn't bring for this "
+            "machine: install ffmpeg, or name its program in the variable IMAGEIO_FFMPEG_EXE; a "
+            "GIF needs nothing more"
+        ) from None
     return program

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import pytest
 
 from adaptgns.command import plain_errors
@@ -28,3 +31,22 @@ def test_plain_errors(
 def test_bugs_keep_their_traceback() -> None:
     with pytest.raises(IndexError), plain_errors():
         raise IndexError
+
+
+def test_sigterm_undoes_what_is_half_done(capsys: pytest.CaptureFixture[str]) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    undone = []
+
+    def work() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            signal.pause()
+        finally:
+            undone.append(True)
+
+    with pytest.raises(SystemExit) as exit_, plain_errors():
+        work()
+    assert undone
+    assert exit_.value.code == 143
+    assert capsys.readouterr().err == "terminated\n"
+    assert signal.getsignal(signal.SIGTERM) == before

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 
+from adaptgns import convert
 from adaptgns.checkpoint import Checkpoint, build_simulator, with_prefix, write_checkpoint
 from adaptgns.config import ModelConfig, TrainConfig
 from adaptgns.convert import main
@@ -296,9 +299,54 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         run(good, tmp_path / "two.h5")
     assert "two.h5: exists; choose another name or remove it" in capsys.readouterr().err
+    chunked = tmp_path / "chunked.h5"
+    with h5py.File(good) as file, h5py.File(chunked, "w") as copy:
+        for group, members in file.items():
+            positions = members["position"][()]
+            copy.create_dataset(
+                f"{group}/position",
+                data=positions,
+                chunks=(3, *positions.shape[1:]),
+                fletcher32=True,
+            )
+            copy[f"{group}/particle_type"] = members["particle_type"][()]
+        at = copy["00001/position"].id.get_chunk_info(2).byte_offset
+        size = copy["00001/position"].id.get_chunk_info(2).size
+    content = bytearray(chunked.read_bytes())
+    content[at] ^= 1
+    chunked.write_bytes(content)
+    told = refusal(capsys, chunked, out)
+    assert f"chunked.h5: trajectory 00001: position: the chunk at [6, 0, 0], bytes {at} to " in told
+    assert f"to {at + size}, can't be read: " in told
+    assert told.endswith("; copy or download the file again\n")
     damaged = tmp_path / "damaged.h5"
     damaged.write_bytes(good.read_bytes()[:-200])
     assert "damaged.h5" in refusal(capsys, damaged, out)
+
+
+def test_sigterm_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = tmp_path / "source"
+    source.mkdir()
+    write_split(source / "train.h5", trajectories())
+    kept = {path.name for path in tmp_path.iterdir()}
+
+    def stopped(path: Path, given: Iterable[Trajectory]) -> None:
+        def until_the_second() -> Iterator[Trajectory]:
+            yield next(iter(given))
+            assert list(tmp_path.glob(".out*.partial/*"))  # something is half done
+            os.kill(os.getpid(), signal.SIGTERM)
+            signal.pause()
+
+        write_split(path, until_the_second())
+
+    monkeypatch.setattr(convert, "write_split", stopped)
+    with pytest.raises(SystemExit) as exit_:
+        run(source, tmp_path / "out")
+    assert exit_.value.code == 143
+    assert capsys.readouterr().err.splitlines()[-1] == "terminated"
+    assert {path.name for path in tmp_path.iterdir()} == kept
 
 
 def test_a_damaged_split_leaves_no_folder(
@@ -418,6 +466,9 @@ def test_wrong_frames_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "last.ply: no number in its name" in refusal(capsys, folder, out)
     (folder / "last.ply").rename(folder / "f_99.vtk")
     assert "frames in .ply, .vtk; one format is accepted" in refusal(capsys, folder, out)
+    (folder / "f_99.vtk").unlink()
+    path.unlink()
+    assert "frame 5 follows frame 3, elsewhere they are 1 apart" in refusal(capsys, folder, out)
     (tmp_path / "set" / "train").mkdir(parents=True)
     assert "no .vtk, .vtu, .ply files, nor folders" in refusal(
         capsys, tmp_path / "set", tmp_path / "o"

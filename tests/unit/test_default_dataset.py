@@ -145,3 +145,13 @@ def test_names_and_folders(tmp_path: Path) -> None:
         dataset_folder("watrdrop")
     with pytest.raises(DataError, match=r"scene is 'goop'; waterdrop, sand"):
         default_dataset("goop")  # type: ignore[arg-type]
+
+
+def test_a_folder_comes_before_the_embedded_set_of_its_name(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("waterdrop").mkdir()
+    assert dataset_folder("waterdrop").parent == cache  # what holds no data set is not meant
+    (tmp_path / "waterdrop" / "metadata.json").touch()
+    assert dataset_folder("waterdrop") == Path("waterdrop")

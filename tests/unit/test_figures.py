@@ -76,6 +76,9 @@ def test_curves_are_those_of_the_report(run: Path) -> None:
     point = figures["pareto"].axes[0].containers[1][0]
     assert point.get_xdata()[0] == pytest.approx(report["scalars"]["edges_per_step"]["mean"])
     assert point.get_ydata()[0] == pytest.approx(report["scalars"]["mse"]["mean"])
+    point = figures["pareto"].axes[1].containers[1][0]
+    times = [report["scalars"][name]["mean"] for name in ("graph_ms", "model_ms")]
+    assert point.get_xdata()[0] == pytest.approx(sum(times)) == pytest.approx(2.5)
     loss, _, rollout = figures["training"].axes
     np.testing.assert_array_equal(loss.get_lines()[0].get_ydata(), [0.5, -0.5])
     np.testing.assert_array_equal(rollout.get_lines()[0].get_ydata(), [np.nan])
@@ -96,6 +99,18 @@ def test_runs_differ_in_colour_and_policies_in_dash(
         "two, adaptive",
     ]
     assert legend(drawn(run)["pareto"]) == ["GNS nll, fixed", "GNS nll, adaptive"]
+
+
+def test_radii_differ_in_colour(tmp_path: Path, metadata: Metadata) -> None:
+    files = [
+        write_rollout(tmp_path / f"{radius}.h5", metadata, radius=radius)
+        for radius in (None, 0.019)
+    ]
+    evaluate(files, out=tmp_path)
+    figure = drawn(tmp_path)["pareto"]
+    assert legend(figure) == ["GNS nll, fixed", "GNS nll, fixed, r = 0.019"]
+    colours = [container[0].get_color() for container in figure.axes[0].containers]
+    assert colours[0] != colours[1]
 
 
 def test_what_is_not_there_is_left_out(tmp_path: Path, metadata: Metadata, run: Path) -> None:

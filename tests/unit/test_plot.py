@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from adaptgns import video
@@ -106,6 +107,23 @@ def test_without_its_package_or_with_another_suffix_no_film(
             main(["animate", "--rollout", str(adaptive), "--out", str(tmp_path / name)])
         assert message in capsys.readouterr().err
         assert not (tmp_path / name).exists()
+
+
+def test_without_a_program_no_film(
+    tmp_path: Path,
+    adaptive: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is missing")
+    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE", raising=False)
+    monkeypatch.setattr(imageio_ffmpeg._utils, "_get_ffmpeg_exe", lambda: None)
+    with pytest.raises(SystemExit, match="2"):
+        main(["animate", "--rollout", str(adaptive), "--out", str(tmp_path / "a.mp4")])
+    told = capsys.readouterr().err
+    assert "which imageio-ffmpeg doesn't bring for this machine: install ffmpeg" in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "a.mp4").exists()
 
 
 def test_sigma_colours_the_prediction_alone(tmp_path: Path, metadata: Metadata) -> None:
@@ -238,11 +256,36 @@ def test_view_of_three_dimensions(metadata: Metadata) -> None:
     assert points[2, 0] > points[0, 0]
     assert list(order).index(1) > list(order).index(0)
     corners = view.frame.reshape(-1, 2)
-    assert len(view.frame) == 12
+    assert (len(view.frame), len(view.front)) == (9, 3)
     assert (corners > view.lower).all()
     assert (corners < view.upper).all()
     assert (points > view.lower).all()
     assert (points < view.upper).all()
+
+
+@pytest.mark.parametrize("solid", [False, True])
+def test_what_covers_what(metadata: Metadata, solid: bool) -> None:
+    view = View(in_three_dimensions(metadata) if solid else metadata)
+    # The second and third are kinematic. In 3D they are in front, the first is farthest away.
+    positions = np.array([[0.2, 0.2, 0.2], [0.8, 0.2, 1.8], [0.7, 0.2, 1.7]])[:, : 2 + solid]
+    artist = Figure().subplots().scatter([], [], linewidths=0)
+    view.paint(
+        artist,
+        positions,
+        np.tile([1.0, 0.0, 0.0, 1.0], (3, 1)),
+        np.array([True, False, False]),
+        kinematic="#0000ff",
+        background="#000000",
+    )
+    faces = artist.get_facecolors()
+    if solid:
+        assert (faces[0, 0] > 0, list(faces[1:, 0])) == (True, [0, 0])
+        assert faces[0, 0] < faces[1, 2] < faces[2, 2] < 1  # paler the farther
+        assert (artist.get_edgecolors()[:, :3] <= faces[:, :3]).all()
+        np.testing.assert_allclose(artist.get_offsets()[2], view.points(positions)[0][1])
+    else:
+        np.testing.assert_array_equal(faces[:, :3], [[0, 0, 1], [0, 0, 1], [1, 0, 0]])
+        assert not artist.get_linewidths().any()
 
 
 def test_edges_through_a_periodic_boundary_are_not_drawn(metadata: Metadata) -> None:

@@ -153,13 +153,37 @@ def test_truncated_files(tmp_path: Path, compression: str | None) -> None:
             list(open_split(tmp_path, "train"))
 
 
+def test_damaged_bytes_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "train.h5"
+    with h5py.File(path, "w") as file:
+        positions = np.random.default_rng(0).random((12, 9, 2), dtype=np.float32)
+        file.create_dataset("00000/position", data=positions, compression="gzip", chunks=(5, 9, 2))
+        file["00000/particle_type"] = np.zeros(9, int)
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    told = set()
+    for _ in range(300):
+        damaged = bytearray(content)
+        damaged[rng.integers(len(content))] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        try:  # the file has bytes that mean nothing
+            list(open_split(tmp_path, "train"))
+        except DataError as error:
+            told.add(str(error))
+    assert len(told) > 10
+    assert all(message.startswith(f"{path}: ") for message in told)
+    assert any("position: the chunk at [5, 0, 0], bytes" in message for message in told)
+
+
 def test_truncation_after_opening(tmp_path: Path) -> None:
     write_split(tmp_path / "train.h5", [trajectory(100)])
     split = open_split(tmp_path, "train")
     split.window(0, 90, 100)
     with (tmp_path / "train.h5").open("r+b") as file:
         file.truncate(file.seek(0, os.SEEK_END) // 2)
-    with pytest.raises(DataError, match=r"train\.h5: trajectory 00000: frame 9\d: .*truncated"):
+    with pytest.raises(
+        DataError, match=r"train\.h5: trajectory 00000: frame 9\d: .*at byte \d+; it is trunc"
+    ):
         split.window(0, 90, 100)
 
 

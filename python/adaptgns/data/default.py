@@ -19,6 +19,7 @@ from adaptgns import _core
 from adaptgns.atomic import replace_text
 from adaptgns.data.errors import DataError
 from adaptgns.data.generation import SplitPlan, generate_dataset
+from adaptgns.data.metadata import FILE_NAME
 from adaptgns.data.scenes import SceneName
 
 if TYPE_CHECKING:
@@ -49,12 +50,14 @@ _ABANDONED_AFTER = 24 * 3600.0
 def dataset_folder(data: str | Path) -> Path:
     """The folder of a data set named on a command line: a folder, or the name of an embedded one.
 
+    A data set that lies in a folder of such a name is meant, not the embedded one.
+
     Raises:
         DataError: neither.
     """
-    if data in EMBEDDED:
-        return default_dataset(data)
     folder = Path(data)
+    if data in EMBEDDED and not (folder / FILE_NAME).exists():
+        return default_dataset(data)
     if not folder.is_dir():
         raise DataError(
             f"data is {str(data)!r}; a folder with metadata.json and train, valid and test files, "

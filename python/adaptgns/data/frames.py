@@ -8,6 +8,8 @@ are ordered, since solvers that sort particles in space write them in another or
 from __future__ import annotations
 
 import re
+from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -137,7 +139,15 @@ def _ordered(folder: Path) -> list[Path]:
         other = numbers.setdefault(int(found[-1]), path)
         if other is not path:
             raise DataError(f"{path}: the same frame number as {other.name}")
-    return [numbers[number] for number in sorted(numbers)]
+    ordered = sorted(numbers)
+    steps = Counter(after - before for before, after in pairwise(ordered))
+    for before, after in pairwise(ordered):
+        if after - before != (usual := steps.most_common(1)[0][0]):
+            raise DataError(
+                f"{folder}: frame {after} follows frame {before}, elsewhere they are {usual} "
+                "apart; frames evenly apart in time are accepted, so one may be missing"
+            )
+    return [numbers[number] for number in ordered]
 
 
 def _read(path: Path) -> _Frame:

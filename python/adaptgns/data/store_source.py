@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 _PADDING = -1
 """LagrangeBench's particle type for rows that only fill up an array."""
+
+_AGAIN = "copy or download the file again"
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class StoreSource:
         self.path = path
         self._cache_bytes = cache_bytes
         with self._file() as file:
-            self._entries = [self._entry(file, name) for name in sorted(file)]
+            self._entries = [self._entry(file, name) for name in sorted(file, key=str)]
         self.shapes = tuple(
             Shape(entry.group, entry.shape[0], len(entry.particle_type), entry.shape[2])
             for entry in self._entries
@@ -93,24 +95,23 @@ class StoreSource:
 
     @contextmanager
     def _file(self) -> Iterator[h5py.File]:
-        try:
-            with h5py.File(self.path, "r") as file:
-                yield file
-        except DataError:
-            raise
-        except FileNotFoundError:
-            raise DataError(f"{self.path}: there is no such file") from None
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise DataError(f"{self.path}: damaged, truncated or not HDF5: {error}") from error
+        with _told(f"{self.path}"), h5py.File(self.path, "r") as file:
+            yield file
 
     def _entry(self, file: h5py.File, group: str) -> _Entry:
         where = f"{self.path}: trajectory {group}"
+        with _told(where):
+            return self._checked_entry(file, group, where)
+
+    def _checked_entry(self, file: h5py.File, group: str, where: str) -> _Entry:
         members = file[group]
         if not isinstance(members, h5py.Group):
             raise DataError(f"{where}: a data set; a group per trajectory is accepted")
         for required in ("position", "particle_type"):
-            if not isinstance(members.get(required), h5py.Dataset):
-                raise DataError(f"{where}: no {required}; the group holds {sorted(members)}")
+            if required not in (names := sorted(members, key=str)):
+                raise DataError(f"{where}: no {required}; the group holds {names}")
+            if not isinstance(members[required], h5py.Dataset):
+                raise DataError(f"{where}: {required} is a group; a data set is accepted")
         position = members["position"]
         if position.ndim != 3 or position.dtype.kind != "f":
             raise DataError(
@@ -118,10 +119,11 @@ class StoreSource:
                 "floating [T, N, d] is accepted"
             )
         particles = position.shape[1]
-        types = particle_types(members["particle_type"][()], particles, where)
+        types = particle_types(_read(members["particle_type"], where), particles, where)
         material = None
         if "material_property" in members:
-            material = material_properties(members["material_property"][()], particles, where)
+            raw = _read(members["material_property"], where)
+            material = material_properties(raw, particles, where)
         real = types != _PADDING
         if not real.all():
             types = types[real]
@@ -136,8 +138,13 @@ class StoreSource:
             particle_type=types,
             material_property=material,
         )
-        if entry.offset is not None and entry.offset + entry.nbytes > self.path.stat().st_size:
-            raise DataError(f"{where}: the file ends before its positions do; it is truncated")
+        if entry.offset is not None:
+            end, size = entry.offset + entry.nbytes, self.path.stat().st_size
+            if end > size:
+                raise DataError(
+                    f"{where}: position goes on to byte {end}, but the file ends at byte {size}; "
+                    f"it is truncated: {_AGAIN}"
+                )
         return entry
 
     def _load(self, index: int) -> Trajectory:
@@ -161,13 +168,52 @@ class StoreSource:
         if flat.size != (stop - start) * per_frame:
             raise DataError(
                 f"{self.path}: trajectory {entry.group}: frame {start + flat.size // per_frame}: "
-                "the file ends here; it is truncated"
+                f"the file ends here, at byte {self.path.stat().st_size}; it is truncated: {_AGAIN}"
             )
         return _clean(flat.reshape(stop - start, particles, dim), entry)
 
     def _read_chunked(self, entry: _Entry, start: int, stop: int) -> npt.NDArray[np.float32]:
         with self._file() as file:
-            return _clean(file[entry.group]["position"][start:stop], entry)
+            where = f"{self.path}: trajectory {entry.group}"
+            return _clean(_read(file[entry.group]["position"], where, slice(start, stop)), entry)
+
+
+@contextmanager
+def _told(where: str) -> Iterator[None]:
+    """Tells what h5py finds wrong, with its place ``where``."""
+    try:
+        yield
+    except DataError:
+        raise
+    except FileNotFoundError:
+        raise DataError(f"{where}: there is no such file") from None
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise DataError(f"{where}: damaged, truncated or not HDF5: {error}; {_AGAIN}") from error
+
+
+def _read(dataset: h5py.Dataset, where: str, rows: slice | tuple[()] = ()) -> Any:
+    """The ``rows`` of ``dataset``, or all of it; DataError that names the damaged part of it."""
+    try:
+        return dataset[rows]
+    except (OSError, RuntimeError) as error:
+        name = dataset.name.rpartition("/")[2]
+        raise DataError(
+            f"{where}: {name}: {_damaged_part(dataset)} can't be read: {error}; {_AGAIN}"
+        ) from error
+
+
+def _damaged_part(dataset: h5py.Dataset) -> str:
+    """The first chunk that can't be read, and its bytes in the file, as far as it tells."""
+    with suppress(OSError, RuntimeError, ValueError):  # where the index of chunks is damaged, too
+        for index in range(dataset.id.get_num_chunks() if dataset.chunks else 0):
+            chunk = dataset.id.get_chunk_info(index)
+            starts, sizes = chunk.chunk_offset, dataset.chunks
+            try:
+                dataset[tuple(slice(at, at + size) for at, size in zip(starts, sizes, strict=True))]
+            except OSError:
+                end = chunk.byte_offset + chunk.size
+                return f"the chunk at {list(starts)}, bytes {chunk.byte_offset} to {end},"
+    return "part of it"
 
 
 def _clean(positions: npt.NDArray[Any], entry: _Entry) -> npt.NDArray[np.float32]:
