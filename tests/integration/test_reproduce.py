@@ -106,7 +106,7 @@ def test_the_chosen_rule_is_within_the_budget_and_what_is_reported(made: Reprodu
         within = [row["mse"] for row in result["trials"] if row["edges"] <= budget]
         assert chosen["mse"] == min(within)
         valid = json.loads((metrics / "mse-0-fixed-valid.json").read_text())["rollouts"][0]
-        assert budget == valid["scalars"]["edges_per_step"]["mean"]
+        assert budget == pytest.approx(valid["scalars"]["edges_per_step"]["mean"], rel=1e-5)
         for seed in (0, 1):
             row = json.loads((metrics / f"tuned-{seed}-adaptive.json").read_text())["rollouts"][0]
             assert row["settings"]["radius"] == chosen["radius"]

@@ -206,7 +206,8 @@ class DataSet:
         seed = profile.seeds[0]
         run = Run(self, NLL, seed)
         run.require_training()
-        budget = valid_edges(self, MSE, seed, "fixed")
+        count = profile.sweep.trajectories
+        budget = valid_edges(self, MSE, seed, "fixed", trajectories=count)
         sweep(
             SweepConfig(
                 checkpoint=run.folder,
@@ -217,7 +218,7 @@ class DataSet:
                 radius=tuple(round(share * radius, 6) for share in profile.sweep.radius),
                 edges=budget,
                 steps=self.study.last_mark,
-                trajectories=profile.sweep.trajectories,
+                trajectories=count,
                 device=self.study.device,
             ),
             console,
@@ -465,14 +466,18 @@ def matched_radius(data: DataSet, seed: int, radius: float) -> float:
     return round(math.sqrt(squared), 6)
 
 
-def valid_edges(data: DataSet, model: Model, seed: int, policy: PolicyName) -> float:
-    """Edges per step of a model's rollouts of the validation split, which are made once."""
+def valid_edges(
+    data: DataSet, model: Model, seed: int, policy: PolicyName, *, trajectories: int | None = None
+) -> float:
+    """Edges per step of a model's rollouts of the validation split, which are made once; of its
+    first ``trajectories``, or all."""
     run = Run(data, model, seed)
     path = data.metrics / f"{model.name}-{seed}-{policy}-valid.json"
     if not path.exists():
         run.require_training()
         write_json(path, run.measured(policy, split="valid", console=Console(quiet=True)))
-    return float(read_json(path)["rollouts"][0]["scalars"]["edges_per_step"]["mean"])
+    edges = read_json(path)["rollouts"][0]["scalars"]["edges_per_step"]["per_trajectory"]
+    return float(np.mean(edges[:trajectories]))
 
 
 def refuse_difference(path: str, made: object, wanted: object) -> None:
