@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 
 def publish(partial: Path, final: Path) -> None:
     """Give a finished file its name, after its bytes have reached the disk.
@@ -71,16 +73,22 @@ def replace_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write ``content`` with six significant digits, whole or not at all."""
-    replace_text(path, json.dumps(_six_digits(content), allow_nan=False) + "\n")
+    replace_text(path, json.dumps(json_types(content, digits=6), allow_nan=False) + "\n")
 
 
-def _six_digits(value: Any) -> Any:
+def json_types(value: Any, *, digits: int | None = None) -> Any:
+    """``value`` as JSON types, numbers with so many significant ``digits``, and null for those that
+    JSON does not know."""
     match value:
         case dict():
-            return {key: _six_digits(item) for key, item in value.items()}
+            return {key: json_types(item, digits=digits) for key, item in value.items()}
         case list() | tuple():
-            return [_six_digits(item) for item in value]
-        case float():
-            return float(f"{value:.6g}") if math.isfinite(value) else None
+            return [json_types(item, digits=digits) for item in value]
+        case np.ndarray() | np.generic():
+            return json_types(value.tolist(), digits=digits)
+        case float() if not math.isfinite(value):
+            return None
+        case float() if digits is not None:
+            return float(f"{value:.{digits}g}")
         case _:
             return value

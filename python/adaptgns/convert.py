@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress
 
 from adaptgns.atomic import folder_written_whole
 from adaptgns.checkpoint import (
@@ -42,6 +35,7 @@ from adaptgns.data.store_source import StoreSource
 from adaptgns.data.tfrecord import TfrecordFile
 from adaptgns.data.trajectories import SPELLINGS, Trajectories, find_split, open_split
 from adaptgns.geoelements import read_geoelements, write_geoelements
+from adaptgns.progress import progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -106,7 +100,7 @@ def convert(config: ConvertConfig, console: Console) -> list[str]:
             f"{source}: {', '.join((*_DATA, *_CHECKPOINTS))} files and folders are accepted"
         )
     suffix = _check_target(config, dest, (".h5", ".npz"))
-    with _progress(console) as progress:
+    with progress_bar(console, "trajectories") as progress:
         _write(
             dest,
             suffix,
@@ -196,7 +190,7 @@ def _convert_folder(config: ConvertConfig, console: Console) -> list[str]:
     content = _content(source)
     dim = config.dim or (None if content is None else _section(content).get("dim"))
     with folder_written_whole(dest) as partial:
-        with _progress(console) as progress:
+        with progress_bar(console, "trajectories") as progress:
             for split, path in found.items():
                 trajectories = _open(path, dim, flatten=config.dim == 2)
                 _write(partial / f"{split}{suffix}", suffix, _told(trajectories, split, progress))
@@ -334,19 +328,6 @@ def _export_checkpoint(source: Path, dest: Path) -> list[str]:
             f"{model.hidden_layers} and {model.steps}"
         )
     return notes
-
-
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("trajectories"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-    )
 
 
 if __name__ == "__main__":

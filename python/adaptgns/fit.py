@@ -13,14 +13,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
@@ -41,6 +33,7 @@ from adaptgns.losses import training_loss, variance_loss
 from adaptgns.network import Prediction
 from adaptgns.policies import two_sided
 from adaptgns.processes import ALONE, Processes
+from adaptgns.progress import progress_bar
 from adaptgns.rollout import to_sigma
 from adaptgns.segment import Graph
 from adaptgns.snapshot import snapshot
@@ -163,15 +156,8 @@ class Trainer:
                 processes=self.processes.count,
             )
         )
-        progress = Progress(
-            TextColumn("training"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("loss {task.fields[loss]}  {task.fields[speed]} steps/s"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=console,
-        )
+        fields = "steps, loss {task.fields[loss]}, {task.fields[speed]} a second,"
+        progress = progress_bar(console, fields)
         self.simulator.train()
         losses: list[Tensor] = []
         with (
@@ -180,7 +166,7 @@ class Trainer:
             progress,
         ):
             task = progress.add_task(
-                "", total=config.steps, completed=self.step, loss="-", speed="-"
+                "training", total=config.steps, completed=self.step, loss="-", speed="-"
             )
             logged = time.perf_counter()
             while self.step < config.steps:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,7 +15,7 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-from adaptgns.atomic import replace_text
+from adaptgns.atomic import json_types, replace_text
 from adaptgns.graph_statistics import GraphStatistics
 from adaptgns.metrics import Calibration
 
@@ -90,7 +89,7 @@ class Report:
                 "true": _statistics_json(self.true_statistics),
             },
         }
-        result: dict[str, Any] = _finite(content)
+        result: dict[str, Any] = json_types(content)
         return result
 
     def write(self, path: Path) -> None:
@@ -254,18 +253,3 @@ def _measures_json(measures: Measures) -> dict[str, Any]:
 
 def _statistics_json(statistics: Sequence[GraphStatistics]) -> list[dict[str, Any]]:
     return [asdict(each) for each in statistics]
-
-
-def _finite(value: Any) -> Any:
-    """``value`` as JSON types, with null for numbers that JSON does not know."""
-    match value:
-        case dict():
-            return {key: _finite(item) for key, item in value.items()}
-        case list() | tuple():
-            return [_finite(item) for item in value]
-        case np.ndarray() | np.generic():
-            return _finite(value.tolist())
-        case float() if not math.isfinite(value):
-            return None
-        case _:
-            return value

@@ -12,14 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress
 
 from adaptgns import _core
 from adaptgns.data.errors import DataError
@@ -30,6 +23,7 @@ from adaptgns.data.store import StoreWriter, partial_path, read_origin
 from adaptgns.data.trajectories import Trajectories, open_split
 from adaptgns.data.trajectory import MIN_FRAMES, Trajectory
 from adaptgns.interruption import interruption
+from adaptgns.progress import progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -101,7 +95,7 @@ def generate_dataset(
     finished = [split for split, plan in plans.items() if _is_finished(folder, split, plan)]
     _refuse_foreign_metadata(folder)
     statistics = None
-    with _progress(console) as progress:
+    with progress_bar(console, "trajectories") as progress:
         for split, plan in plans.items():
             path = folder / f"{split}.h5"
             if split in finished:
@@ -240,16 +234,3 @@ def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description:>5}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("trajectories"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-    )

@@ -176,6 +176,16 @@ vector! {
     __m256 8 _mm256_loadu_ps _mm256_storeu_ps _mm256_set1_ps _mm256_fmadd_ps,
 }
 
+/// A product to be taken: `out`, of rows `stride` apart, begins with `start` and gets `a` times `b`.
+#[derive(Clone, Copy)]
+struct Task<'a> {
+    out: *mut f32,
+    stride: usize,
+    start: Start<'a>,
+    a: Matrix<'a>,
+    b: Matrix<'a>,
+}
+
 /// Tile by tile of `R` rows, at most 8, and `C` vectors.
 #[inline(always)]
 fn tiles<V: Vector, const R: usize, const C: usize>(
@@ -195,21 +205,27 @@ fn tiles<V: Vector, const R: usize, const C: usize>(
     if let Start::Row(row) = start {
         assert!(columns <= row.len());
     }
-    let out = out.as_mut_ptr();
+    let task = Task {
+        out: out.as_mut_ptr(),
+        stride,
+        start,
+        a,
+        b,
+    };
     let mut column = 0;
     // SAFETY: as just asserted, all that is read and written lies in the slices; the caller has
     // chosen vectors that the processor has.
     unsafe {
         while column + C * V::LANES <= columns {
-            strip::<V, R, C>(out, stride, start, a, b, column);
+            strip::<V, R, C>(task, column);
             column += C * V::LANES;
         }
         while column + V::LANES <= columns {
-            strip::<V, R, 1>(out, stride, start, a, b, column);
+            strip::<V, R, 1>(task, column);
             column += V::LANES;
         }
         while column < columns {
-            strip::<[f32; 1], R, 1>(out, stride, start, a, b, column);
+            strip::<[f32; 1], R, 1>(task, column);
             column += 1;
         }
     }
@@ -218,49 +234,45 @@ fn tiles<V: Vector, const R: usize, const C: usize>(
 /// All rows of `C` vectors of columns from `column`.
 ///
 /// # Safety
-/// The processor has such vectors, and the numbers of `out`, `a` and `b` are there.
+/// The processor has such vectors, and the numbers of the task are there.
 #[inline(always)]
-unsafe fn strip<V: Vector, const R: usize, const C: usize>(
-    out: *mut f32,
-    stride: usize,
-    start: Start<'_>,
-    a: Matrix<'_>,
-    b: Matrix<'_>,
-    column: usize,
-) {
+unsafe fn strip<V: Vector, const R: usize, const C: usize>(task: Task<'_>, column: usize) {
     let mut row = 0;
     // SAFETY: handed on.
     unsafe {
-        while row + R <= a.rows {
-            tile::<V, R, C>(out, stride, start, a, b, row, column);
+        while row + R <= task.a.rows {
+            tile::<V, R, C>(task, row, column);
             row += R;
         }
-        if row + 4 <= a.rows {
-            tile::<V, 4, C>(out, stride, start, a, b, row, column);
+        if row + 4 <= task.a.rows {
+            tile::<V, 4, C>(task, row, column);
             row += 4;
         }
-        if row + 2 <= a.rows {
-            tile::<V, 2, C>(out, stride, start, a, b, row, column);
+        if row + 2 <= task.a.rows {
+            tile::<V, 2, C>(task, row, column);
             row += 2;
         }
-        if row < a.rows {
-            tile::<V, 1, C>(out, stride, start, a, b, row, column);
+        if row < task.a.rows {
+            tile::<V, 1, C>(task, row, column);
         }
     }
 }
 
 /// # Safety
-/// The processor has such vectors, and the numbers of `out`, `a` and `b` are there.
+/// The processor has such vectors, and the numbers of the task are there.
 #[inline(always)]
 unsafe fn tile<V: Vector, const R: usize, const C: usize>(
-    out: *mut f32,
-    stride: usize,
-    start: Start<'_>,
-    a: Matrix<'_>,
-    b: Matrix<'_>,
+    task: Task<'_>,
     row: usize,
     column: usize,
 ) {
+    let Task {
+        out,
+        stride,
+        start,
+        a,
+        b,
+    } = task;
     // SAFETY: rows `row..row + R` and the vectors from `column` are inside, as the callers see to;
     // `out` overlaps neither matrix, being borrowed alone.
     unsafe {
