@@ -41,6 +41,8 @@ class Checkpoint:
     best_score: float
     """Lowest validation score so far; inf before the first."""
     tensors: dict[str, Tensor]
+    validated: bool = True
+    """Whether the validation that is due at this step has been done."""
 
     def group(self, name: str) -> dict[str, Tensor]:
         """The tensors whose names start with ``name.``, without that prefix."""
@@ -78,6 +80,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "metadata": json.dumps(checkpoint.metadata.to_json()),
         "step": str(checkpoint.step),
         "best_score": repr(checkpoint.best_score),
+        "validated": str(checkpoint.validated),
     }
     with written_whole(path) as partial:
         partial.write_bytes(save(checkpoint.tensors, header))
@@ -106,6 +109,7 @@ def read_checkpoint(path: Path, *, device: str = "cpu") -> Checkpoint:
         step=int(header["step"]),
         best_score=float(header["best_score"]),
         tensors=tensors,
+        validated=header.get("validated") != "False",
     )
 
 

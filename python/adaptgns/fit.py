@@ -87,6 +87,7 @@ class Trainer:
         self.optimizer = torch.optim.Adam(self.simulator.parameters(), fused=True)
         self.step = 0
         self.best_score = math.inf
+        self.validated = True
         if checkpoint is not None:
             self._restore(checkpoint)
         self.windows = Windows(train, metadata, config, noise=config.noise)
@@ -119,6 +120,7 @@ class Trainer:
         groups = self.optimizer.state_dict()["param_groups"]
         self.optimizer.load_state_dict({"state": state, "param_groups": groups})
         self.step, self.best_score = checkpoint.step, checkpoint.best_score
+        self.validated = checkpoint.validated or self.valid is None
 
     def checkpoint(self, *, resumable: bool) -> Checkpoint:
         """The run as it stands; ``resumable`` with all that training needs to go on."""
@@ -126,10 +128,12 @@ class Trainer:
         if resumable:
             for index, state in self.optimizer.state_dict()["state"].items():
                 tensors |= with_prefix(f"optimizer.{index}", state)
-        return Checkpoint(self.config, self.metadata, self.step, self.best_score, tensors)
+        return Checkpoint(
+            self.config, self.metadata, self.step, self.best_score, tensors, self.validated
+        )
 
     def save(self) -> None:
-        """Write the checkpoint that training goes on from.
+        """Write the checkpoint that training goes on from; all processes wait until it is there.
 
         Raises :class:`TrainingStopped`, and keeps the one before, where a weight is not finite:
         the losses so far were those before the last update.
@@ -138,6 +142,7 @@ class Trainer:
             raise self._diverged("the weights became infinite or NaN")
         if self.processes.first:
             write_checkpoint(self.folder / LAST, self.checkpoint(resumable=True))
+        self.processes.wait()
 
     def run(self, console: Console) -> None:
         """Train to the last step.
@@ -169,15 +174,29 @@ class Trainer:
                 "training", total=config.steps, completed=self.step, loss="-", speed="-"
             )
             logged = time.perf_counter()
-            while self.step < config.steps:
+            while self.step < config.steps or not self.validated:
+                if self.processes.any(bool(interrupted)):
+                    self._mean_loss(losses)
+                    self.save()
+                    signals = interrupted or ["a signal to another process"]
+                    raise TrainingStopped(
+                        f"stopped by {signals[0]} after step {self.step}; nothing is lost. "
+                        f"Go on with\n  python -m adaptgns.train --resume {self.folder}"
+                    )
+                if not self.validated:
+                    self.validated = True
+                    if log is not None:
+                        self._validate(log)
+                    self.save()
+                    logged = time.perf_counter()
+                    continue
                 batch = next(batches)
                 losses.append(self.train_step(None if batch is None else batch.to(self.device)))
                 self.step += 1
                 progress.advance(task)
                 last = self.step == config.steps
-                # Several processes stop at one step, which they agree on now and then.
-                agree = self.processes.count == 1 or self.step % SHOW_EVERY == 0
-                stop = agree and self.processes.any(bool(interrupted))
+                due = self.valid is not None and (self.step % config.validate_every == 0 or last)
+                self.validated = not due
                 if self.step % SHOW_EVERY == 0 or last:
                     loss = float(torch.stack(losses).mean())
                     speed = len(losses) / (time.perf_counter() - logged)
@@ -189,21 +208,10 @@ class Trainer:
                         log.write(self.step, {"loss": mean, **values})
                     losses.clear()
                     logged = time.perf_counter()
-                if self.valid is not None and (self.step % config.validate_every == 0 or last):
-                    self._mean_loss(losses)
-                    if log is not None:
-                        self._validate(log)
-                    self.processes.wait()
-                    logged = time.perf_counter()
-                if self.step % config.checkpoint_every == 0 or last or stop:
+                # Before a validation, too: it may outlast the time that a launcher gives to end.
+                if self.step % config.checkpoint_every == 0 or last or due:
                     self._mean_loss(losses)
                     self.save()
-                if stop and not last:
-                    signals = interrupted or ["a signal to another process"]
-                    raise TrainingStopped(
-                        f"stopped by {signals[0]} after step {self.step}; nothing is lost. "
-                        f"Go on with\n  python -m adaptgns.train --resume {self.folder}"
-                    )
 
     def train_step(self, batch: Batch | None) -> Tensor:
         """One optimizer step on ``batch``, this process's share of it, None where that is nothing;

@@ -64,7 +64,6 @@ def test_two_processes_train_as_one_and_lose_nothing(drops: Path, tmp_path: Path
     assert "Traceback" not in out
     stopped = read_checkpoint(two / LAST).step
     assert 100 <= stopped < 200
-    assert stopped % 10 == 0
     assert losses(two) == pytest.approx(losses(one)[:1], rel=1e-3)
 
     # A worker that is killed ends the job, and the checkpoint stays as it was.

@@ -24,6 +24,7 @@ from adaptgns.fit import Trainer, TrainingStopped
 from adaptgns.graph import adaptive_graph
 from adaptgns.network import Prediction
 from adaptgns.policies import Adaptive
+from adaptgns.processes import Processes
 from adaptgns.rollout import steps, to_sigma
 from adaptgns.segment import Graph
 from tests.conftest import graph_of
@@ -176,6 +177,57 @@ def test_signals_save_and_say_how_to_go_on(
     assert read_checkpoint(tmp_path / LAST).step == 6
 
 
+class Two(Processes):
+    """Two processes of which the other one does as this one; it gets a signal in step 3."""
+
+    def __init__(self) -> None:
+        super().__init__(rank=0, count=2)
+        self.asked: list[str] = []
+
+    def any(self, mine: bool) -> bool:
+        self.asked.append("any")
+        return mine or self.asked.count("any") == 4
+
+    def wait(self) -> None:
+        self.asked.append("wait")
+
+    def mean_gradients(self, _: object, loss: torch.Tensor | None, __: int) -> torch.Tensor:
+        assert loss is not None
+        return loss.detach()
+
+
+def test_a_signal_to_another_process_stops_at_once_and_none_leaves_before_it_is_saved(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    run = trainer(drops, tmp_path, small_config)
+    run.processes = two = Two()
+    with pytest.raises(TrainingStopped, match="a signal to another process after step 3"):
+        run.run(QUIET)
+    assert two.asked == [*["any"] * 4, "wait"]
+    assert read_checkpoint(tmp_path / LAST).step == 3
+
+
+def test_a_run_that_ends_in_a_validation_goes_on_with_it(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit, "validate", fail)
+        with pytest.raises(KeyboardInterrupt):
+            trainer(drops, tmp_path, small_config).run(QUIET)
+    kept = read_checkpoint(tmp_path / LAST)
+    assert (kept.step, kept.validated) == (6, False)
+
+    trainer(drops, tmp_path, small_config, resume=True).run(QUIET)
+    scores = {e["step"]: e["valid_rollout_mse"] for e in log(tmp_path) if "valid_rollout_mse" in e}
+    assert list(scores) == [6, 12]
+    kept = read_checkpoint(tmp_path / LAST)
+    assert kept.validated
+    assert kept.best_score == min(scores.values())
+
+
 def test_a_full_disk_keeps_the_last_checkpoint(
     drops: Path, tmp_path: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,7 +242,7 @@ def test_a_full_disk_keeps_the_last_checkpoint(
     monkeypatch.setattr(os, "fsync", full_later)
     with pytest.raises(OSError, match="No space left"):
         run.run(QUIET)
-    assert read_checkpoint(tmp_path / LAST).step == 4
+    assert read_checkpoint(tmp_path / LAST).step == 6
 
 
 def test_learning_rate_schedules(drops: Path, tmp_path: Path, small_config: TrainConfig) -> None:
