@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from datetime import timedelta
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -16,17 +17,26 @@ from adaptgns.config import Device, torch_device
 
 T = TypeVar("T")
 
+PATIENCE = timedelta(days=1)
+"""How long the others wait for the first, which makes the data, validates and writes."""
+
+
+class OtherEndedError(RuntimeError):
+    """Another process is gone, and what all were to do together cannot be done."""
+
 
 @dataclass(frozen=True)
 class Processes:
     """``count`` processes that take each step together; this one is number ``rank``.
 
     Each works on its share of the samples, holds the same weights, and makes the same update. The
-    first one alone writes.
+    first one alone writes. What they do together raises :class:`OtherEndedError` where one is gone.
     """
 
     rank: int = 0
     count: int = 1
+    patient: Any = None
+    """Torch's group of all that is used where one may be long in coming; None for its default."""
 
     @property
     def first(self) -> bool:
@@ -51,7 +61,8 @@ class Processes:
                 gradient = torch.zeros_like(parameter)
             parts.append(gradient.flatten() * weight)
         flat = torch.cat([part.float() for part in parts])
-        dist.all_reduce(flat)
+        with _together():
+            dist.all_reduce(flat)
         flat = flat / flat[0]
         gradients = flat[2:].split([parameter.numel() for parameter in own])  # type: ignore[no-untyped-call]
         for parameter, gradient in zip(own, gradients, strict=True):
@@ -62,22 +73,46 @@ class Processes:
         """Whether it is so in any process; all must ask."""
         if self.count == 1:
             return mine
-        answers: list[bool] = [False] * self.count
-        dist.all_gather_object(answers, mine)
-        return any(answers)
+        answer = torch.tensor(int(mine))
+        with _together():
+            dist.all_reduce(answer, dist.ReduceOp.MAX, group=self.patient)
+        return bool(answer)
 
-    def same(self, mine: T) -> T:
-        """What the first process says; all must ask."""
+    def same(self, ask: Callable[[], T]) -> T:
+        """What ``ask`` gives the first process, which alone calls it; all must come here."""
         if self.count == 1:
-            return mine
-        said = [mine]
-        dist.broadcast_object_list(said)
-        return said[0]
+            return ask()
+        said: list[Any] = [ask() if self.first else None]
+        with _together():
+            dist.broadcast_object_list(said, group=self.patient)
+        answer: T = said[0]
+        return answer
 
     def wait(self) -> None:
         """Until all are here."""
         if self.count > 1:
-            dist.barrier()
+            with _together():
+                dist.barrier(group=self.patient)
+
+    @contextmanager
+    def first_ahead(self) -> Iterator[None]:
+        """What the first process does before the others begin; if it fails, they do not."""
+        if not self.first:
+            self.wait()
+        yield
+        if self.first:
+            self.wait()
+
+
+@contextmanager
+def _together() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        reason = str(error).partition("\n")[0].partition(". ")[0]
+        raise OtherEndedError(
+            f"another process ended, and its own message says why ({reason})"
+        ) from error
 
 
 ALONE = Processes()
@@ -92,8 +127,16 @@ def processes(device: Device) -> Iterator[Processes]:
     on_gpu = torch_device(device).type == "cuda"
     if on_gpu:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    dist.init_process_group("nccl" if on_gpu else "gloo")
+    patient = None
+    if on_gpu:
+        dist.init_process_group("nccl")
+        patient = dist.new_group(backend="gloo", timeout=PATIENCE)
+    else:
+        dist.init_process_group("gloo", timeout=PATIENCE)
     try:
-        yield Processes(dist.get_rank(), dist.get_world_size())
-    finally:
-        dist.destroy_process_group()
+        yield Processes(dist.get_rank(), dist.get_world_size(), patient)
+    except BaseException:
+        # Not NCCL's, which would wait for the others: they may not have met the exception.
+        dist.destroy_process_group(patient)
+        raise
+    dist.destroy_process_group()

@@ -32,7 +32,7 @@ from adaptgns.fit import Trainer, TrainingStopped
 from adaptgns.fused import divide_threads
 from adaptgns.plot import animate
 from adaptgns.presets import PRESETS
-from adaptgns.processes import Processes, processes
+from adaptgns.processes import OtherEndedError, Processes, processes
 from adaptgns.rollout import write_rollouts
 
 CONFIG = "config.json"
@@ -41,7 +41,7 @@ CONFIG = "config.json"
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
     console = Console()
-    with plain_errors(torch.OutOfMemoryError):
+    with plain_errors(torch.OutOfMemoryError, OtherEndedError):
         config = parse(sys.argv[1:] if argv is None else list(argv))
         with processes(config.device) as group:
             own = console if group.first else Console(quiet=True)
@@ -107,32 +107,30 @@ def _take(arguments: list[str], option: str) -> tuple[str | None, list[str]]:
 def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path, Path]:
     """Train by ``config``, as one of the processes of ``group``; the run folder and that of the
     data."""
-    folder = group.same(run_folder(config))
+    folder = group.same(lambda: run_folder(config))
     checkpoint = None if config.resume is None else read_checkpoint(config.resume / LAST)
     threads = config.threads or torch.get_num_threads()
     if torch_device(config.device).type == "cpu":
         divide_threads(threads)
     else:
         torch.set_num_threads(threads)
-    if group.first:  # who makes or completes what the others read
-        read_metadata(dataset_folder(config.data))
-    group.wait()
-    data = dataset_folder(config.data)
-    metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
-    train_split, valid_split, test_split = (
-        open_split(data, split) for split in ("train", "valid", "test")
-    )
-    for split in (train_split, valid_split, test_split):  # before anything depends on them
-        check_split(split, metadata)
-    trainer = Trainer(
-        config,
-        metadata,
-        folder,
-        train=train_split,
-        valid=valid_split,
-        checkpoint=checkpoint,
-        processes=group,
-    )
+    with group.first_ahead():  # to make or complete what all read, and to tell what is wrong
+        data = dataset_folder(config.data)
+        metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
+        train_split, valid_split, test_split = (
+            open_split(data, split) for split in ("train", "valid", "test")
+        )
+        for split in (train_split, valid_split, test_split):  # before anything depends on them
+            check_split(split, metadata)
+        trainer = Trainer(
+            config,
+            metadata,
+            folder,
+            train=train_split,
+            valid=valid_split,
+            checkpoint=checkpoint,
+            processes=group,
+        )
     if group.first:
         replace_text(folder / CONFIG, json.dumps(to_json(config), indent=1))
     console.print(
