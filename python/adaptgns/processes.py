@@ -61,6 +61,8 @@ class Processes:
                 gradient = torch.zeros_like(parameter)
             parts.append(gradient.flatten() * weight)
         flat = torch.cat([part.float() for part in parts])
+        if not weight:
+            flat.zero_()  # the mean of nothing may be NaN
         with _together():
             dist.all_reduce(flat)
         flat = flat / flat[0]

@@ -56,3 +56,13 @@ def test_the_first_goes_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
         with Processes(rank, 2).first_ahead():
             done.append("work")
     assert done == ["work", "all there", "all there", "work"]
+
+
+def test_gradients_of_no_particles_count_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    summed: list[torch.Tensor] = []
+    monkeypatch.setattr(dist, "all_reduce", summed.append)
+    layer = torch.nn.Linear(2, 1)
+    loss = layer(torch.full((1, 2), torch.nan)).mean()
+    loss.backward()
+    Processes(1, 2).mean_gradients(layer.parameters(), loss, 0)
+    assert not summed[0].any()
