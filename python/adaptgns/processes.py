@@ -126,12 +126,17 @@ def processes(device: Device) -> Iterator[Processes]:
     if not dist.is_torchelastic_launched():
         yield ALONE
         return
-    on_gpu = torch_device(device).type == "cuda"
-    if on_gpu:
-        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     patient = None
-    if on_gpu:
-        dist.init_process_group("nccl")
+    if torch_device(device).type == "cuda":
+        here, gpus = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()
+        if here > gpus:
+            raise ValueError(
+                f"LOCAL_WORLD_SIZE: got {here} processes for {gpus} GPUs; accepted is at most one "
+                "each (torchrun's --nproc-per-node)"
+            )
+        gpu = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        torch.cuda.set_device(gpu)
+        dist.init_process_group("nccl", device_id=gpu)
         patient = dist.new_group(backend="gloo", timeout=PATIENCE)
     else:
         dist.init_process_group("gloo", timeout=PATIENCE)

@@ -66,3 +66,40 @@ def test_gradients_of_no_particles_count_nothing(monkeypatch: pytest.MonkeyPatch
     loss.backward()
     Processes(1, 2).mean_gradients(layer.parameters(), loss, 0)
     assert not summed[0].any()
+
+
+@pytest.mark.usefixtures("launched")
+def test_every_process_needs_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
+    with (
+        pytest.raises(ValueError, match="LOCAL_WORLD_SIZE: got 3 processes for 2 GPUs"),
+        processes("cuda"),
+    ):
+        pass
+
+
+@pytest.mark.usefixtures("launched")
+def test_a_process_names_its_gpu_and_leaves_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NCCL wants to know the GPU beforehand, and waits for all where a group of its ends."""
+    calls: list[object] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "set_device", calls.append)
+    monkeypatch.setattr(dist, "init_process_group", lambda *a, **k: calls.append((a, k)))
+    monkeypatch.setattr(dist, "new_group", lambda **_: "patient")
+    monkeypatch.setattr(dist, "get_rank", lambda: 0)
+    monkeypatch.setattr(dist, "get_world_size", lambda: 1)
+    monkeypatch.setattr(dist, "destroy_process_group", lambda *a: calls.append(a))
+    gpu = torch.device("cuda", 0)
+    begun = [gpu, (("nccl",), {"device_id": gpu})]
+
+    with processes("cuda") as group:
+        assert group.patient == "patient"
+    assert calls == [*begun, ()]
+
+    calls.clear()
+    with pytest.raises(MemoryError), processes("cuda"):
+        raise MemoryError
+    assert calls == [*begun, ("patient",)]
