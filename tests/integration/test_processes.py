@@ -68,7 +68,7 @@ def test_two_processes_train_as_one_and_lose_nothing(drops: Path, tmp_path: Path
 
     # A worker that is killed ends the job, and the checkpoint stays as it was.
     run = torchrun("--resume", str(two))
-    while not workers(run.pid):
+    while len(workers(run.pid)) < 2:  # a single child may be another program
         assert run.poll() is None, run.communicate()
         time.sleep(0.05)
     os.kill(workers(run.pid)[-1], signal.SIGKILL)
