@@ -52,7 +52,14 @@ luckiest."""
 
 
 class TrainingStopped(Exception):  # noqa: N818 (not an error: nothing is lost)
-    """A run ended before its end; the message says why and how to go on."""
+    """A run ended before its end; the message says why and how to go on.
+
+    With ``alone``, this one of several processes met it, and perhaps no other.
+    """
+
+    def __init__(self, message: str, *, alone: bool = False) -> None:
+        super().__init__(message)
+        self.alone = alone
 
 
 class Trainer:
@@ -300,12 +307,12 @@ class Trainer:
             return None
         positions = window[:, -1].detach().cpu().numpy()
         if not np.isfinite(positions).all():
-            raise self._diverged("the predicted positions became infinite or NaN")
+            raise self._diverged("the predicted positions became infinite or NaN", alone=True)
         build = partial(radius_graph, positions, self.simulator.radius)
         if self.config.graph != "base":
             sigma = to_sigma(earlier)
             if not np.isfinite(sigma).all():
-                raise self._diverged("the predicted variance became infinite or NaN")
+                raise self._diverged("the predicted variance became infinite or NaN", alone=True)
             mobile, rule = batch.mobile.cpu().numpy(), self.config.adaptive
             if self.config.graph == "adaptive":
                 build = partial(
@@ -339,13 +346,14 @@ class Trainer:
             raise self._diverged(f"the loss became {mean} in the last {len(losses)} steps")
         return mean
 
-    def _diverged(self, what: str) -> TrainingStopped:
+    def _diverged(self, what: str, *, alone: bool = False) -> TrainingStopped:
         last = self.folder / LAST
         kept = f"{last} holds the last good state. " if last.exists() else ""
         return TrainingStopped(
             f"{what}, by step {self.step}. {kept}Look at: the learning rate (--lr, now "
             f"{self.config.lr}), gradient clipping (--clip), and the data "
-            f"(python -m adaptgns.inspect {self.config.data})"
+            f"(python -m adaptgns.inspect {self.config.data})",
+            alone=alone,
         )
 
     def _validate(self, log: Log) -> None:

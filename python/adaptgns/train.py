@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             except TrainingStopped as stopped:
                 if group.first:
                     console.print(str(stopped), markup=False)
-                else:  # of what the first may not have met
+                elif stopped.alone:
                     print(f"process {group.rank}: {stopped}", file=sys.stderr)
                 raise SystemExit(1) from None
         if not group.first:

@@ -111,8 +111,11 @@ def test_a_loss_that_is_not_finite_stops_with_what_to_look_at(
         return original(*args, **options) * (torch.nan if len(calls) == 10 else 1)
 
     monkeypatch.setattr(fit, "training_loss", sometimes_nan)
-    with pytest.raises(TrainingStopped, match=r"loss became nan.*last good state.*--lr.*--clip"):
+    with pytest.raises(
+        TrainingStopped, match=r"loss became nan.*last good state.*--lr.*--clip"
+    ) as stopped:
         run.run(QUIET)
+    assert not stopped.value.alone
     kept = read_checkpoint(tmp_path / LAST)
     assert kept.step == 8
     assert all(t.isfinite().all() for t in kept.tensors.values())
@@ -129,8 +132,11 @@ def test_positions_that_are_not_finite_stop_likewise(
     with torch.no_grad():
         next(run.simulator.network.decoder.parameters()).fill_(torch.nan)
         next(run.simulator.network.node_encoder.parameters()).fill_(torch.nan)
-    with pytest.raises(TrainingStopped, match=r"became infinite or NaN.*last good state.*--lr"):
+    with pytest.raises(
+        TrainingStopped, match=r"became infinite or NaN.*last good state.*--lr"
+    ) as stopped:
         run.train_step(batch)
+    assert stopped.value.alone
 
 
 def test_adaptive_training_needs_edges_and_a_variance(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from datetime import timedelta
 
 import pytest
 import torch
 import torch.distributed as dist
 
+from adaptgns import train
+from adaptgns.fit import TrainingStopped
 from adaptgns.processes import OtherEndedError, Processes, processes
 
 
@@ -56,6 +59,24 @@ def test_the_first_goes_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
         with Processes(rank, 2).first_ahead():
             done.append("work")
     assert done == ["work", "all there", "all there", "work"]
+
+
+@pytest.mark.parametrize(("rank", "alone", "told"), [(0, False, 1), (1, False, 0), (1, True, 1)])
+def test_what_all_have_met_the_first_tells(
+    rank: int,
+    alone: bool,
+    told: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def stop(*_: object) -> None:
+        raise TrainingStopped("it ended", alone=alone)
+
+    monkeypatch.setattr(train, "processes", lambda _: nullcontext(Processes(rank, 2)))
+    monkeypatch.setattr(train, "train", stop)
+    with pytest.raises(SystemExit):
+        train.main(["--preset", "smoke"])
+    assert "".join(capsys.readouterr()).count("it ended") == told
 
 
 def test_gradients_of_no_particles_count_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
