@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import statistics
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from machine import machine, resident
 from torch import Tensor
 from torch.nn.functional import softplus
 
@@ -49,8 +49,9 @@ def plain(net: EncodeProcessDecode, nodes: Tensor, edges: Tensor, graph: Graph) 
     assert net.variance_head is not None
     nodes, edges = net.node_encoder(nodes), net.edge_encoder(edges)
     for layer in net.layers:
-        ends = torch.cat([nodes[graph.receivers], nodes[graph.senders], edges], dim=1)
-        messages = layer.edge_mlp(ends)
+        messages = layer.edge_mlp(
+            torch.cat([nodes[graph.receivers], nodes[graph.senders], edges], dim=1)
+        )
         incoming = torch.zeros_like(nodes, dtype=messages.dtype)
         incoming = incoming.index_add_(0, graph.receivers, messages)
         nodes = nodes + layer.node_mlp(torch.cat([incoming, nodes], dim=1))
@@ -127,14 +128,6 @@ def print_memory(size: str, form: str) -> None:
     print(resident("VmHWM") - before)
 
 
-def resident(what: str) -> float:
-    """A figure of this process's memory, in MiB."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(what + ":"):
-            return int(line.split()[1]) / 2**10
-    raise RuntimeError(f"{what}: not told by this system")
-
-
 def measure(rounds: int) -> dict[str, object]:
     results = {}
     for size in SIZES:
@@ -173,9 +166,7 @@ def main() -> None:
         print_memory(*options.memory)
         return
     report = {
-        "processor": platform.processor() or platform.machine(),
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
+        "machine": machine(),
         "rounds": options.rounds,
         "sizes": measure(options.rounds),
     }
