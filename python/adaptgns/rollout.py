@@ -160,6 +160,7 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
     """Roll out the trajectories that ``config`` asks for, and write them to ``config.out``."""
     checkpoint = read_checkpoint(config.checkpoint)
     simulator = checkpoint.simulator().to(torch_device(config.device))
+    simulator.network.precision = config.precision
     folder = dataset_folder(config.data or checkpoint.config.data)
     split = open_split(folder, config.split)
     count = len(split) if config.trajectories is None else min(config.trajectories, len(split))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from adaptgns.config import HISTORY, TYPE_EMBEDDING, ModelConfig
+from adaptgns.config import HISTORY, TYPE_EMBEDDING, ModelConfig, Precision
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectory import PARTICLE_TYPES
 from adaptgns.network import EncodeProcessDecode, Prediction
@@ -37,6 +37,7 @@ class Simulator(nn.Module):
         noise: float,
         variance: bool,
         variance_alone: bool = False,
+        precision: Precision = "float32",
     ) -> None:
         super().__init__()
         self.config = config
@@ -60,6 +61,7 @@ class Simulator(nn.Module):
             variance_layers=config.variance_layers,
             variance_alone=variance_alone,
             legacy_edges=config.edge_update == "legacy",
+            precision=precision,
         )
 
         def constant(name: str, values: object) -> None:
