@@ -100,7 +100,7 @@ def steps(
 
     def predict_sigma(edges: Edges) -> NDArray[np.float32]:
         nonlocal asking
-        graph = Graph.for_inference(*edges).to(device)
+        graph = Graph.for_inference(*edges).send(device)
         before = time.perf_counter()
         sigma = to_sigma(predict(graph))
         asking += time.perf_counter() - before
@@ -121,7 +121,7 @@ def steps(
                 predict_sigma=predict_sigma,
             )
             edges = policy.edges(state)
-            graph = Graph.for_inference(*edges).to(device)
+            graph = Graph.for_inference(*edges).send(device)
         built = time.perf_counter()
         prediction = predict(graph)
         following = simulator.advance(window, prediction.acceleration)
