@@ -5,7 +5,8 @@
 Particles lie uniformly at random in a square, 6.8 others within the radius of each; the network
 has the paper's size and random weights; the steps are those of ``adaptgns.rollout``. Beside the
 memory measured stands what the plain form of ``step.py`` needs for the same: ``--form plain``
-measures that, too, where it fits.
+measures that, too, where it fits. ``--device cuda`` takes the steps on a GPU, whose memory is then
+measured, too.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from machine import machine, resident
 from step import plain
 from torch import Tensor
 
-from adaptgns.config import HISTORY, ModelConfig
+from adaptgns.config import HISTORY, ModelConfig, Precision
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectory import Trajectory
 from adaptgns.network import EncodeProcessDecode, Prediction
@@ -79,10 +80,14 @@ def plain_mib(particles: int, edges: int) -> float:
     return 4 * (edges * per_edge + particles * per_node) / 2**20
 
 
-def measure(particles: int, count: int, form: str) -> dict[str, Any]:
+def measure(
+    particles: int, count: int, form: str, device: str, precision: Precision
+) -> dict[str, Any]:
     metadata, trajectory = scene(particles, count)
     torch.manual_seed(0)
     simulator = Simulator(MODEL, metadata, noise=0.0, variance=True).eval()
+    simulator.to(device)
+    simulator.network.precision = precision
     if form == "plain":
         simulator.network.__class__ = Plain
     torch.linalg.norm(torch.randn(500, 500) @ torch.randn(500, 500))  # libraries are loaded
@@ -93,13 +98,17 @@ def measure(particles: int, count: int, form: str) -> dict[str, Any]:
         taken.append({"graph_s": step.graph_ms / 1e3, "model_s": step.model_ms / 1e3})
         edges = step.edges + particles
         print(f"{edges:,} edges", "  ".join(f"{k} {v:.3g}" for k, v in taken[-1].items()))
+    gpu = torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else None
     return {
         "form": form,
+        "device": device,
+        "precision": precision,
         "particles": particles,
         "edges": edges,
         "steps": taken,
         "memory_before_mib": before,
         "memory_peak_mib": resident("VmHWM"),
+        "gpu_peak_mib": gpu,
         "one_latent_per_edge_mib": 4 * edges * MODEL.latent / 2**20,
         "plain_computed_mib": plain_mib(particles, edges),
     }
@@ -109,15 +118,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--particles", type=int, default=1_000_000)
     parser.add_argument("--steps", type=int, default=3)
-    parser.add_argument("--form", choices=("core", "plain"), default="core")
+    parser.add_argument("--form", choices=("ours", "plain"), default="ours")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--precision", choices=("float32", "bf16"), default="float32")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     report = {
         "machine": machine(),
-        **measure(options.particles, options.steps, options.form),
+        **measure(
+            options.particles, options.steps, options.form, options.device, options.precision
+        ),
     }
     for name, value in report.items():
-        if name.endswith("mib"):
+        if name.endswith("mib") and value is not None:
             print(f"{name:26} {value:10,.0f}")
     if options.out:
         options.out.write_text(json.dumps(report, indent=1) + "\n")
