@@ -64,6 +64,7 @@ def build_simulator(config: TrainConfig, metadata: Metadata) -> Simulator:
         noise=config.noise,
         variance=config.loss != "mse",
         variance_alone=config.loss == "decoupled" and config.variance_weight == 0,
+        precision=config.precision,
     )
 
 

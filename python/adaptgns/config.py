@@ -26,6 +26,7 @@ PolicyName = Literal[
     "fixed", "adaptive", "two-sided", "two-pass", "random", "acceleration", "divergence", "knn"
 ]
 Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["float32", "bf16"]
 EdgeUpdate = Literal["fixed", "legacy"]
 
 Range = tuple[str, Callable[[float], bool]]
@@ -142,6 +143,8 @@ class RolloutConfig:
     """Seed of the policy random."""
     device: Device = "auto"
     """auto: a GPU where there is one."""
+    precision: Precision = "float32"
+    """bf16: the message passing in 16 bits, everything around it in 32; for large networks."""
 
     def __post_init__(self) -> None:
         _require(
@@ -235,6 +238,8 @@ class TrainConfig:
     """Test trajectories rolled out at the end; None: all."""
     test_horizon: int | None = 200
     """Frames of those rollouts; None: to the end."""
+    precision: Precision = "float32"
+    """bf16: the message passing in 16 bits, everything around it in 32; for large networks."""
 
     def __post_init__(self) -> None:
         _require(

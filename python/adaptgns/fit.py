@@ -330,12 +330,12 @@ class Trainer:
                 radii = self.simulator.radius * np.concatenate(factors)
                 build = partial(radius_graph, positions, radii)
         edges = build(
-            ptr=batch.ptr.cpu().numpy(),
+            ptr=batch.ptr.numpy(),
             box=self.metadata.box,
             self_edges=self.config.model.self_edges,
             return_offsets=True,
         )
-        return Graph.from_numpy(*edges).to(self.device)
+        return Graph.from_numpy(*edges).send(self.device)
 
     def _mean_loss(self, losses: list[Tensor]) -> float:
         """Mean of ``losses``; raises :class:`TrainingStopped` unless it is finite."""

@@ -6,6 +6,7 @@ Shapes: N particles, E edges, L latent width.
 from __future__ import annotations
 
 import itertools
+from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from adaptgns import fused
+from adaptgns.config import Precision
 from adaptgns.segment import Graph, at_receivers, at_senders, sum_at_receivers
 
 VARIANCE_FLOOR = 1e-8
@@ -28,6 +30,14 @@ class Prediction(NamedTuple):
     """``[N]``, the variance per dimension; None for a network without a variance head."""
 
 
+class LayerNorm(nn.LayerNorm):
+    """torch's, in the type of its parameters: of bf16 on a CPU torch sums their gradients in bf16,
+    too, and over thousands of edges is off by more than half."""
+
+    def forward(self, rows: Tensor) -> Tensor:
+        return super().forward(rows.to(self.weight.dtype))
+
+
 def mlp(inputs: int, width: int, hidden_layers: int, outputs: int, *, norm: bool) -> nn.Sequential:
     """``hidden_layers`` ReLU layers of ``width``, a linear output, and a LayerNorm if asked."""
     sizes = [inputs, *[width] * hidden_layers]
@@ -36,7 +46,7 @@ def mlp(inputs: int, width: int, hidden_layers: int, outputs: int, *, norm: bool
         layers += [nn.Linear(a, b), nn.ReLU()]
     layers.append(nn.Linear(sizes[-1], outputs))
     if norm:
-        layers.append(nn.LayerNorm(outputs))
+        layers.append(LayerNorm(outputs))
     return nn.Sequential(*layers)
 
 
@@ -61,7 +71,7 @@ class InteractionLayer(nn.Module):
         hidden = functional.linear(edges, edge_part, first.bias)  # [E, L]
         hidden = hidden + at_receivers(functional.linear(nodes, receiver_part), graph)
         hidden = hidden + at_senders(functional.linear(nodes, sender_part), graph)
-        messages = self.edge_mlp[1:](hidden)
+        messages = self.edge_mlp[1:](hidden).to(edges.dtype)
         incoming = sum_at_receivers(messages, graph)  # [N, L]
         update = self.node_mlp(torch.cat([incoming, nodes], dim=1))
         return nodes + update, edges + (edges if self.legacy_edges else messages)
@@ -73,6 +83,10 @@ class EncodeProcessDecode(nn.Module):
     Without ``edges`` it is the per-particle baseline: the same encoder, node updates, decoder and
     variance head, and no message ever arrives. With ``variance_alone`` what the variance head
     learns changes nothing else.
+
+    ``precision`` may be changed at any time. With bf16 the latents of the edges and the products
+    of the encoders and of message passing are in that type; the parameters, the sums over the steps
+    at the nodes, the heads and the outputs stay in float32.
     """
 
     def __init__(
@@ -89,8 +103,10 @@ class EncodeProcessDecode(nn.Module):
         variance_layers: int = 1,
         variance_alone: bool = False,
         legacy_edges: bool = False,
+        precision: Precision = "float32",
     ) -> None:
         super().__init__()
+        self.precision = precision
         self.legacy_edges = legacy_edges
         self.variance_alone = variance_alone
         self.node_encoder = mlp(node_features, latent, hidden_layers, latent, norm=True)
@@ -112,7 +128,8 @@ class EncodeProcessDecode(nn.Module):
         self, node_features: Tensor, edge_features: Tensor | None, graph: Graph | None
     ) -> Prediction:
         """Predictions for ``node_features`` ``[N, :]`` and ``edge_features`` ``[E, :]``."""
-        if fused.applies(node_features) and not self.legacy_edges:
+        exact = self.precision == "float32"
+        if exact and fused.applies(node_features) and not self.legacy_edges:
             acceleration, *variances = fused.network(
                 self._perceptrons(),
                 node_features,
@@ -122,7 +139,8 @@ class EncodeProcessDecode(nn.Module):
                 alone=self.variance_alone,
             )
         else:
-            nodes = self._encode_and_process(node_features, edge_features, graph)
+            with self._autocast(node_features.device.type):
+                nodes = self._encode_and_process(node_features, edge_features, graph)
             others = nodes.detach() if self.variance_alone else nodes
             acceleration = self.decoder(nodes)
             variances = [head(others) for head in self._heads()[1:]]
@@ -130,6 +148,11 @@ class EncodeProcessDecode(nn.Module):
         if variances:
             variance = functional.softplus(variances[0]).squeeze(1) + VARIANCE_FLOOR
         return Prediction(acceleration, variance)
+
+    def _autocast(self, device: str) -> AbstractContextManager[object]:
+        if self.precision == "bf16":
+            return torch.autocast(device, torch.bfloat16)
+        return nullcontext()
 
     def _encode_and_process(
         self, node_features: Tensor, edge_features: Tensor | None, graph: Graph | None
@@ -140,6 +163,8 @@ class EncodeProcessDecode(nn.Module):
                 nodes = nodes + layer(nodes)
             return nodes
         edges = self.edge_encoder(edge_features)
+        if self.precision == "bf16":
+            edges = edges.bfloat16()
         for layer in self.layers:
             nodes, edges = layer(nodes, edges, graph)
         return nodes

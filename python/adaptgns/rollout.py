@@ -100,7 +100,7 @@ def steps(
 
     def predict_sigma(edges: Edges) -> NDArray[np.float32]:
         nonlocal asking
-        graph = Graph.for_inference(*edges).to(device)
+        graph = Graph.for_inference(*edges).send(device)
         before = time.perf_counter()
         sigma = to_sigma(predict(graph))
         asking += time.perf_counter() - before
@@ -121,7 +121,7 @@ def steps(
                 predict_sigma=predict_sigma,
             )
             edges = policy.edges(state)
-            graph = Graph.for_inference(*edges).to(device)
+            graph = Graph.for_inference(*edges).send(device)
         built = time.perf_counter()
         prediction = predict(graph)
         following = simulator.advance(window, prediction.acceleration)
@@ -160,6 +160,7 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
     """Roll out the trajectories that ``config`` asks for, and write them to ``config.out``."""
     checkpoint = read_checkpoint(config.checkpoint)
     simulator = checkpoint.simulator().to(torch_device(config.device))
+    simulator.network.precision = config.precision
     folder = dataset_folder(config.data or checkpoint.config.data)
     split = open_split(folder, config.split)
     count = len(split) if config.trajectories is None else min(config.trajectories, len(split))

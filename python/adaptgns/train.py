@@ -110,7 +110,7 @@ def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path
     folder = group.same(lambda: run_folder(config))
     checkpoint = None if config.resume is None else read_checkpoint(config.resume / LAST)
     threads = config.threads or torch.get_num_threads()
-    if torch_device(config.device).type == "cpu":
+    if torch_device(config.device).type == "cpu" and config.precision == "float32":
         divide_threads(threads)
     else:
         torch.set_num_threads(threads)
@@ -195,6 +195,7 @@ def report(folder: Path, data: Path, config: TrainConfig, console: Console) -> N
                 steps=config.test_horizon,
                 trajectories=config.test_trajectories,
                 out=out,
+                precision=config.precision,
             ),
             console,
         )

@@ -24,7 +24,7 @@ from adaptgns.config import HISTORY, TrainConfig
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
 from adaptgns.noise import compression, drift_noise, random_walk_noise
-from adaptgns.segment import Graph
+from adaptgns.segment import Graph, Parcel
 
 Key = tuple[int, int]
 """(epoch, number of the window in the data set)"""
@@ -41,7 +41,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(Parcel):
     """Several samples as one graph of N particles with no edges between samples."""
 
     frames: Tensor
@@ -55,7 +55,7 @@ class Batch:
     mobile: Tensor
     """bool ``[N]``, the non-kinematic particles"""
     ptr: Tensor
-    """int64 ``[B + 1]``, offsets of the samples"""
+    """int64 ``[B + 1]``, offsets of the samples; on the CPU always, where graphs are built"""
     graph: Graph | None
     """The base graph of the last input positions, or of those one frame before where training
     sees adaptive graphs and needs a variance from there; None for a model without edges"""
@@ -77,7 +77,8 @@ class Batch:
 
     def to(self, device: torch.device) -> Batch:
         """The same batch on another device."""
-        return self._with(lambda part: part.to(device, non_blocking=True))
+        moved = self._with(lambda part: part.to(device, non_blocking=True))
+        return replace(moved, ptr=self.ptr)
 
     def pin_memory(self) -> Batch:
         """The same batch in page-locked memory; torch's DataLoader calls this."""

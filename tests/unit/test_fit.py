@@ -17,7 +17,7 @@ from rich.console import Console
 
 from adaptgns import fit
 from adaptgns.checkpoint import BEST, LAST, build_simulator, read_checkpoint
-from adaptgns.config import AdaptiveConfig, TrainConfig
+from adaptgns.config import AdaptiveConfig, Precision, TrainConfig
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.fit import Trainer, TrainingStopped
@@ -61,10 +61,11 @@ def test_one_batch_can_be_overfitted(
     assert np.mean(losses[-10:]) < losses[0] - 1
 
 
+@pytest.mark.parametrize("precision", ["float32", "bf16"])
 def test_resumed_equals_uninterrupted(
-    drops: Path, tmp_path: Path, small_config: TrainConfig
+    drops: Path, tmp_path: Path, small_config: TrainConfig, precision: Precision
 ) -> None:
-    config = replace(small_config, clip=1.0, mirror=True, warmup=3, unroll=2)
+    config = replace(small_config, clip=1.0, mirror=True, warmup=3, unroll=2, precision=precision)
     trainer(drops, tmp_path / "whole", config).run(QUIET)
 
     run = trainer(drops, tmp_path / "parts", config)

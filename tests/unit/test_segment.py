@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -49,3 +50,25 @@ def test_a_graph_for_inference_gathers_and_sums_alike() -> None:
         results.append(sum_at_receivers(per_edge, graph))
         assert len(per_edge) == edges.shape[1]
     assert torch.equal(*results)
+
+
+def test_a_graph_goes_to_a_gpu_by_way_of_page_locked_memory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is done can be seen without a GPU; that it can be done, on one alone."""
+    done = []
+
+    def pin(graph: Graph) -> Graph:
+        done.append("pinned")
+        return graph
+
+    def to(graph: Graph, device: torch.device, *, non_blocking: bool = False) -> Graph:
+        done.append(f"{device} {non_blocking}")
+        return graph
+
+    graph = random_graph(np.random.default_rng(0), 5, 20)
+    assert graph.send(torch.device("meta")).senders.device.type == "meta"
+    monkeypatch.setattr(Graph, "pin_memory", pin)
+    monkeypatch.setattr(Graph, "to", to)
+    graph.send(torch.device("cuda"))
+    assert done == ["pinned", "cuda True"]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 from collections import Counter
 from dataclasses import replace
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Literal
 
@@ -126,6 +128,31 @@ def test_number_of_workers_changes_nothing(windows: Windows) -> None:
     assert len(alone) == 5
     for a, b in zip(alone, shared, strict=True):
         assert torch.equal(a, b)
+
+
+def test_a_batch_reaches_another_process_whole_and_as_bytes(windows: Windows) -> None:
+    batch: Batch = windows.collate([windows[0, 3], windows[0, 9]])
+    sent = bytes(ForkingPickler.dumps(batch))
+    assert len(sent) > batch.frames.nbytes  # no handle of memory that stays where it is
+    received: Batch = pickle.loads(sent)
+    assert batch.graph is not None
+    assert received.graph is not None
+    for one, other in ((batch, received), (batch.graph, received.graph)):
+        for name, part in vars(one).items():
+            if isinstance(part, torch.Tensor):
+                assert torch.equal(part, getattr(other, name)), name
+    assert received.ahead == batch.ahead
+    received.frames.zero_()  # it is the receiver's own
+    assert batch.frames.any()
+
+
+def test_offsets_stay_where_graphs_are_built(windows: Windows) -> None:
+    batch: Batch = windows.collate([windows[0, 3]])
+    moved = batch.to(torch.device("meta"))
+    assert batch.graph is not None
+    assert moved.graph is not None
+    assert moved.frames.device.type == moved.graph.senders.device.type == "meta"
+    assert moved.ptr is batch.ptr
 
 
 def test_adaptive_training_reads_one_frame_more(windows: Windows) -> None:
