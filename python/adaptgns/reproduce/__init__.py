@@ -23,8 +23,9 @@ from rich.console import Console
 
 from adaptgns.atomic import write_json
 from adaptgns.command import plain_errors
-from adaptgns.config import Device
+from adaptgns.config import Device, torch_device
 from adaptgns.fit import TrainingStopped
+from adaptgns.fused import divide_threads
 from adaptgns.interruption import interruption
 from adaptgns.reproduce import report
 from adaptgns.reproduce.estimates import seconds
@@ -103,6 +104,8 @@ def reproduce(config: ReproduceConfig, console: Console) -> None:
 
 def make(config: ReproduceConfig, study: Study, runs: Sequence[Run], console: Console) -> None:
     """Make those of ``runs`` that are missing, and what is measured beside them."""
+    if study.threads is not None and torch_device(study.device).type == "cpu":
+        divide_threads(study.threads)
     for data in study.sets.values():
         data.describe()
         data.pass_gate(console)
