@@ -63,9 +63,8 @@ def write_into(study: Study, readme: Path) -> None:
         raise ValueError(f"{readme}: holds no {MARKERS[0]} followed by {MARKERS[1]}")
     parts = [_made(study)]
     for table in tables(Results(study)):
-        if table.name.startswith(("rollouts", "comparisons")):
-            # The columns that say it; the report has them all.
-            kept = [0, 1, 2, 3, 7] if table.name.startswith("rollouts") else [0, 3, 4, 5, 6]
+        if table.name.startswith("rollouts"):
+            kept = [0, 1, 2, 3, 7]  # the columns that say it; the report has them all
             rows = [Row([row.cells[i] for i in kept]) for row in table.rows]
             short = Table(table.name, table.title, [table.columns[i] for i in kept], rows)
             parts.append(f"**{table.title}**\n\n{_table(short)}")
