@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from adaptgns.config import HISTORY, TYPE_EMBEDDING, ModelConfig, Precision
 from adaptgns.data.metadata import Metadata
@@ -99,10 +100,7 @@ class Simulator(nn.Module):
 
     def displacement(self, to: Tensor, start: Tensor) -> Tensor:
         """``to - start``, the nearest image of it along periodic axes."""
-        return self._nearest(to - start)
-
-    def _nearest(self, difference: Tensor) -> Tensor:
-        """The nearest image of ``difference`` ``[..., d]``."""
+        difference = to - start
         if self.metadata.box is None:
             return difference
         return difference - self._periods((difference / self.box).round())
@@ -118,12 +116,10 @@ class Simulator(nn.Module):
         ``relative_motion`` the last one and the H - 2 accelerations), the clipped distances to the
         open bounds over the radius, the type's embedding, the material."""
         velocity = self.displacement(window[:, 1:], window[:, :-1])  # [N, H-1, d]
+        normalized = (velocity - self.velocity_mean) / self.velocity_std
         if self.config.relative_motion:
             acceleration = (velocity.diff(dim=1) - self.acceleration_mean) / self.acceleration_std
-            last = (velocity[:, -1:] - self.velocity_mean) / self.velocity_std
-            normalized = torch.cat([acceleration, last], dim=1)
-        else:
-            normalized = (velocity - self.velocity_mean) / self.velocity_std
+            normalized = torch.cat([acceleration, normalized[:, -1:]], dim=1)
         current = window[:, -1, self.open_axes]
         distance = torch.cat([current - self.lower, self.upper - current], dim=1)
         parts = [
@@ -139,22 +135,19 @@ class Simulator(nn.Module):
         """Features ``[E, :]`` of positions ``[N, H, d]``: (sender - receiver) / radius and its
         norm; with ``relative_motion`` also the difference of the last velocities and its part
         along the edge."""
-        dim = window.shape[2]
         positions = window[:, -1]
-        ends = positions
+        displacement = self.displacement(
+            at_senders(positions, graph), at_receivers(positions, graph)
+        )
+        displacement = displacement / self.radius
+        parts = [displacement, displacement.norm(dim=1, keepdim=True)]
         if self.config.relative_motion:
-            ends = torch.cat([ends, self.displacement(positions, window[:, -2])], dim=1)
-        # One component after the other of all edges: torch is slow with rows of a few numbers.
-        difference = (at_senders(ends, graph) - at_receivers(ends, graph)).t().contiguous()
-        displacement = self._nearest(difference[:dim].t()).t() / self.radius  # [d, E]
-        # Kept off 0, where a root has no gradient; torch's norm is slow along this dimension.
-        distance = displacement.square().sum(dim=0, keepdim=True).clamp_min(1e-24).sqrt()
-        parts = [displacement, distance]
-        if self.config.relative_motion:
-            relative = difference[dim:] / (RELATIVE_SPEED * self.velocity_std)[:, None]
-            direction = displacement / distance.clamp_min(1e-3)
-            parts += [relative, (relative * direction).sum(dim=0, keepdim=True)]
-        return torch.cat(parts).t()
+            velocity = self.displacement(positions, window[:, -2])
+            relative = at_senders(velocity, graph) - at_receivers(velocity, graph)
+            relative = relative / (RELATIVE_SPEED * self.velocity_std)
+            direction = functional.normalize(displacement, dim=1, eps=1e-3)
+            parts += [relative, (relative * direction).sum(dim=1, keepdim=True)]
+        return torch.cat(parts, dim=1)
 
     def forward(
         self,
