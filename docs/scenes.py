@@ -35,6 +35,7 @@ class Picture:
     frames: tuple[int, int, int, int]
     seed: int = 0
     dim: int = 2
+    stripe: bool = False  # what begins in the middle of the box is orange
 
 
 PICTURES = {
@@ -45,6 +46,7 @@ PICTURES = {
     "multimaterial": Picture("multimaterial", (0, 90, 140, 900), seed=3),
     "waterramps": Picture("waterramps", (0, 100, 150, 350)),
     "stirrer": Picture("stirrer", (0, 100, 200, 500)),
+    "vortices": Picture("vortices", (0, 60, 150, 390), stripe=True),
     "waterdrop-3d": Picture("waterdrop", (0, 100, 150, 600), dim=3),
     "sand-3d": Picture("sand", (0, 60, 120, 310), dim=3),
     "multimaterial-3d": Picture("multimaterial", (0, 80, 150, 900), dim=3),
@@ -65,6 +67,9 @@ def draw(picture: Picture, path: Path) -> None:
         view = View(read_metadata(Path(folder)))
         trajectory = open_split(Path(folder), "train")[0]
     colours = np.array([COLOURS[kind] for kind in trajectory.particle_type.tolist()])
+    if picture.stripe:
+        height = trajectory.positions[0, :, 1]
+        colours[np.abs(height - height.mean()) < 0.15] = COLOURS[6]
     figure = Figure(figsize=(4 * SIDE, SIDE), dpi=DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     for axes, frame in zip(figure.subplots(1, 4), picture.frames, strict=True):

@@ -104,16 +104,19 @@ def simulate(
     """One trajectory of the embedded data generator (MLS-MPM, Hu et al. 2018).
 
     A box from 0.1 to 0.9 along every axis [m], gravity 9.81 m/s² against the second axis,
-    0.0025 s between frames. The first frame is the scene as drawn.
+    0.0025 s between frames. The first frame is the scene as drawn. In 'vortices' the box is
+    periodic and there is no gravity.
 
     Args:
-        scene: 'waterdrop', 'sand', 'goop', 'jelly', 'multimaterial', 'waterramps' or 'stirrer'.
+        scene: 'waterdrop', 'sand', 'goop', 'jelly', 'multimaterial', 'waterramps', 'stirrer' or
+            'vortices'.
         seed: any integer from 0 to 2**64 - 1; the result depends on the arguments alone,
             whatever else runs.
         frames: number of frames T, at least 1.
         dim: 2 or 3.
         particles: smallest and largest number of particles, from 16 to as many as fill half
             the room for them; None for the published mix. Those of obstacles are not counted.
+            'vortices' has 2,500 particles, in 3D 8,000, whatever else the range holds.
 
     Returns:
         Positions [T, N, dim], all inside the box, and GNS's particle types [N]: 5 for water,

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptgns.data import open_split
+from adaptgns.data import open_split, read_metadata
 from adaptgns.data.scenes import SceneName
 from adaptgns.data.trajectory import INPUT_FRAMES
 from adaptgns.generate import GenerateConfig, generate
+from adaptgns.periodic import minimum_image
 from adaptgns.rollout_file import RolloutFile
 from adaptgns.train import main
 
@@ -49,3 +50,27 @@ def test_a_scene_trains_and_rolls_out(
         following = given.positions[INPUT_FRAMES : INPUT_FRAMES + rollout.steps, obstacle]
         np.testing.assert_array_equal(rollout.predicted[:, obstacle], following)
         assert (rollout.predicted[:, ~obstacle] != rollout.true[:, ~obstacle]).any()
+
+
+@pytest.mark.parametrize(("dim", "particles"), [(2, 2_500), (3, 8_000)])
+def test_a_periodic_set_trains_and_rolls_out(tmp_path: Path, dim: int, particles: int) -> None:
+    data, run = tmp_path / "data", tmp_path / "run"
+    frames = 20 if dim == 2 else 14
+    generate(replace(SMALL, scene="vortices", dim=dim, out=data, particles=None, frames=frames))  # type: ignore[arg-type]
+    metadata = read_metadata(data)
+    assert metadata.periodic == (True,) * dim
+    given = open_split(data, "train")[0]
+    assert given.positions.shape == (frames, particles, dim)
+    moved = np.diff(given.positions, axis=0)
+    assert np.abs(moved).max() > 0.5, "some come in on the other side"
+    assert np.abs(minimum_image(moved, metadata.box)).max() < metadata.radius
+    # Statistics are of the true motion, not of the jumps.
+    assert max(metadata.velocity_std) < metadata.radius
+    horizon = ["--test-horizon", "4", "--test-trajectories", "1", "--validate-horizon", "3"]
+    main(["--preset", "smoke", "--data", str(data), "--out", str(run), "--steps", "3", *horizon])
+    with RolloutFile(run / "rollouts" / "adaptive.h5") as file:
+        rollout = file[0]
+        low, high = metadata.bounds[0]
+        assert rollout.predicted.min() >= low - 1e-6
+        assert rollout.predicted.max() <= high + 1e-6
+        assert rollout.edges.min() > 4 * particles

@@ -11,12 +11,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.progress import Progress
 
 from adaptgns import _core
 from adaptgns.data.errors import DataError
-from adaptgns.data.metadata import FILE_NAME, GNS_KINEMATIC, write_metadata
+from adaptgns.data.metadata import FILE_NAME, GNS_KINEMATIC, period_lengths, write_metadata
 from adaptgns.data.scenes import SCENES, SceneName
 from adaptgns.data.statistics import MotionAccumulator, MotionStatistics, compute_statistics
 from adaptgns.data.store import StoreWriter, partial_path, read_origin
@@ -111,7 +113,8 @@ def generate_dataset(
                 statistics = motion
     if statistics is None:
         train = open_split(folder, "train")
-        statistics = compute_statistics(train, box=None, kinematic_types=GNS_KINEMATIC)
+        box = _box(plans["train"])
+        statistics = compute_statistics(train, box=box, kinematic_types=GNS_KINEMATIC)
     opened = {split: open_split(folder, split) for split in plans}
     write_metadata(folder, _metadata(plans["train"], opened, statistics))
 
@@ -148,7 +151,7 @@ def _simulate(split: str, plan: SplitPlan, index: int) -> Trajectory:
 
 
 def _write_split(path: Path, split: str, plan: SplitPlan, progress: Progress) -> MotionStatistics:
-    motion = MotionAccumulator(plan.dim, box=None, kinematic_types=GNS_KINEMATIC)
+    motion = MotionAccumulator(plan.dim, box=_box(plan), kinematic_types=GNS_KINEMATIC)
     task = progress.add_task(split, total=plan.trajectories)
     with interruption() as interrupted, StoreWriter(path, origin=_origin(split, plan)) as writer:
         for trajectory in simulate_split(split, plan):
@@ -216,7 +219,7 @@ def _metadata(
         "dt": scene.dt,
         "write_every": 1,
         "bounds": [[scene.low, scene.high]] * plan.dim,
-        "periodic_boundary_conditions": [False] * plan.dim,
+        "periodic_boundary_conditions": [scene.periodic] * plan.dim,
         "kinematic_types": list(GNS_KINEMATIC),
         "material_properties": 0,
         "default_connectivity_radius": scene.radii[plan.dim - 2],
@@ -227,6 +230,11 @@ def _metadata(
         content[f"sequence_length_{name}"] = int(split.lengths.max()) - 1
         content[f"num_trajs_{name}"] = len(split)
     return content | statistics.to_file_keys()
+
+
+def _box(plan: SplitPlan) -> npt.NDArray[np.float64] | None:
+    scene = SCENES[plan.scene]
+    return period_lengths(((scene.low, scene.high),) * plan.dim, (scene.periodic,) * plan.dim)
 
 
 def _cores() -> int:

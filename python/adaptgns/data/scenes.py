@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-SceneName = Literal["waterdrop", "sand", "goop", "jelly", "multimaterial", "waterramps", "stirrer"]
+SceneName = Literal[
+    "waterdrop", "sand", "goop", "jelly", "multimaterial", "waterramps", "stirrer", "vortices"
+]
 
 
 @dataclass(frozen=True)
@@ -17,6 +19,7 @@ class Scene:
             rest where there is no such set.
         dt: seconds between frames.
         low, high: the walls, on every axis, in metres.
+        periodic: whether the walls are one and the same place.
         radii: connectivity radius in two and in three dimensions, in metres.
     """
 
@@ -24,6 +27,7 @@ class Scene:
     dt: float = 0.0025
     low: float = 0.1
     high: float = 0.9
+    periodic: bool = False
     radii: tuple[float, float] = (0.015, 0.035)
 
 
@@ -35,4 +39,5 @@ SCENES: dict[SceneName, Scene] = {
     "multimaterial": Scene(frames=1000),
     "waterramps": Scene(frames=600),
     "stirrer": Scene(frames=600),
+    "vortices": Scene(frames=400, periodic=True, radii=(0.024, 0.058)),
 }

@@ -4,8 +4,10 @@ use adaptgns_core::Error;
 use adaptgns_core::mpm::{OBSTACLE_TYPE, Scene, Trajectory, WALLS, trajectory};
 use rayon::prelude::*;
 
+/// Scenes of blocks, of any number of particles; the other fills its box.
 fn scenes() -> impl Iterator<Item = Scene> {
-    Scene::ALL.into_iter().map(|(_, scene)| scene)
+    let all = Scene::ALL.into_iter().map(|(_, scene)| scene);
+    all.filter(|&scene| scene != Scene::Vortices)
 }
 
 /// Number of particles that are not an obstacle's.
@@ -28,7 +30,7 @@ fn assert_inside<const D: usize>(trajectory: &Trajectory<D>) {
 #[test]
 fn a_hundred_seeds_stay_in_the_box_for_a_thousand_frames() {
     (0..100_u64).into_par_iter().for_each(|seed| {
-        let (_, scene) = Scene::ALL[seed as usize % Scene::ALL.len()];
+        let scene = scenes().nth(seed as usize % scenes().count()).unwrap();
         let made = trajectory::<2>(scene, seed, 1000, Some((16, 150))).unwrap();
         assert!((16..=150).contains(&mobile(&made)));
         assert_eq!(made.positions.len(), 1000 * made.particle_types.len());
@@ -38,7 +40,8 @@ fn a_hundred_seeds_stay_in_the_box_for_a_thousand_frames() {
 
 #[test]
 fn full_scenes_and_three_dimensions_stay_in_the_box() {
-    Scene::ALL.into_par_iter().for_each(|(_, scene)| {
+    assert_inside(&trajectory::<2>(Scene::Vortices, 1, 100, None).unwrap());
+    scenes().par_bridge().for_each(|scene| {
         let seed = 1;
         assert_inside(&trajectory::<2>(scene, seed, 320, None).unwrap());
         let solid = trajectory::<3>(scene, seed, 150, Some((300, 600))).unwrap();
@@ -73,6 +76,24 @@ fn the_number_of_particles_is_the_one_asked_for() {
 }
 
 #[test]
+fn vortices_fill_the_box() {
+    let plane = trajectory::<2>(Scene::Vortices, 3, 1, Some((16, 2500))).unwrap();
+    assert_eq!(plane.particle_types, [5; 2500]);
+    let solid = trajectory::<3>(Scene::Vortices, 3, 1, None).unwrap();
+    assert_eq!(solid.particle_types.len(), 8000);
+    let error = trajectory::<2>(Scene::Vortices, 3, 1, Some((16, 2499))).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .contains("accepted is a range that holds 2500"),
+        "{error}"
+    );
+    let again = trajectory::<2>(Scene::Vortices, 3, 1, None).unwrap();
+    assert_eq!(plane, again);
+    assert_ne!(plane, trajectory::<2>(Scene::Vortices, 4, 1, None).unwrap());
+}
+
+#[test]
 fn particles_are_of_the_scenes_materials_and_obstacles_come_last() {
     for scene in scenes() {
         let expected: &[i64] = match scene {
@@ -81,6 +102,7 @@ fn particles_are_of_the_scenes_materials_and_obstacles_come_last() {
             Scene::Goop | Scene::Jelly => &[7],
             Scene::MultiMaterial => &[5, 6, 7],
             Scene::WaterRamps | Scene::Stirrer => &[3, 5],
+            Scene::Vortices => unreachable!("no scene of blocks"),
         };
         let mut found = Vec::new();
         for seed in 0..8 {

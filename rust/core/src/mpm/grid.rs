@@ -55,6 +55,10 @@ pub(crate) struct Grid<const D: usize> {
     pub nodes: Vec<Node<D>>,
     pub spacing: f64,
     walls: Walls,
+    /// Nodes along an axis.
+    side: usize,
+    /// Whether the walls are one and the same place: the node there is the first one.
+    periodic: bool,
     strides: [usize; D],
     /// Where a node is along an axis: -1 or 1 on the low or high wall or beyond, else 0.
     sides: Vec<f64>,
@@ -64,18 +68,26 @@ pub(crate) struct Grid<const D: usize> {
 
 impl<const D: usize> Grid<D> {
     /// A grid on `walls` with nodes on both of them and about `spacing` apart.
-    pub(crate) fn new(walls: Walls, spacing: f64) -> Self {
+    pub(crate) fn new(walls: Walls, spacing: f64, periodic: bool) -> Self {
         let extent = walls.high - walls.low;
         let cells = (extent / spacing).round().max(REACH as f64) as usize;
         let spacing = extent / cells as f64;
-        let side = cells + 1 + 2 * PADDING;
+        let side = if periodic {
+            cells
+        } else {
+            cells + 1 + 2 * PADDING
+        };
         let strides = std::array::from_fn(|axis| side.pow((D - 1 - axis) as u32));
-        let sides = (0..side)
-            .map(|index| f64::from(index >= cells + PADDING) - f64::from(index <= PADDING));
+        let sides = (0..side).map(|index| {
+            let walled = !periodic;
+            f64::from(walled && index >= cells + PADDING) - f64::from(walled && index <= PADDING)
+        });
         Self {
             nodes: vec![Node::EMPTY; side.pow(D as u32)],
             spacing,
             walls,
+            side,
+            periodic,
             strides,
             sides: sides.collect(),
             active: std::array::from_fn(|_| 0..0),
@@ -85,7 +97,7 @@ impl<const D: usize> Grid<D> {
     /// Nodes and weights of the quadratic B-spline around a particle inside the walls;
     /// the weights sum to one.
     pub(crate) fn stencil(&self, position: &[f64; D]) -> Stencil<D> {
-        let mut base = 0;
+        let mut along = [[0; REACH]; D];
         let mut weights = [[0.0; REACH]; D];
         let mut arms = [0.0; D];
         for axis in 0..D {
@@ -96,7 +108,15 @@ impl<const D: usize> Grid<D> {
                 0.5 * (offset - 0.5).powi(2),
             ];
             arms[axis] = -offset * self.spacing;
-            base += first * self.strides[axis];
+            along[axis] = std::array::from_fn(|step| {
+                let node = first + step;
+                self.strides[axis]
+                    * if self.periodic {
+                        node % self.side
+                    } else {
+                        node
+                    }
+            });
         }
         let mut stencil = Stencil {
             nodes: [0; MAX_STENCIL],
@@ -105,13 +125,13 @@ impl<const D: usize> Grid<D> {
         };
         for k in 0..Stencil::<D>::LEN {
             let mut remainder = k;
-            let mut node = base;
+            let mut node = 0;
             let mut weight = 1.0;
             let mut arm = arms;
             for axis in (0..D).rev() {
                 let step = remainder % REACH;
                 remainder /= REACH;
-                node += step * self.strides[axis];
+                node += along[axis][step];
                 weight *= weights[axis][step];
                 arm[axis] += step as f64 * self.spacing;
             }
@@ -125,6 +145,10 @@ impl<const D: usize> Grid<D> {
     /// Empties the nodes in use and takes into use those around `positions`.
     pub(crate) fn cover<'a>(&mut self, positions: impl Iterator<Item = &'a [f64; D]>) {
         self.for_each_node(|node, _| *node = Node::EMPTY);
+        if self.periodic {
+            self.active = std::array::from_fn(|_| 0..self.side);
+            return;
+        }
         let (mut low, mut high) = ([f64::INFINITY; D], [f64::NEG_INFINITY; D]);
         for position in positions {
             for axis in 0..D {
@@ -137,9 +161,10 @@ impl<const D: usize> Grid<D> {
     }
 
     /// First node of the spline around a coordinate, and the coordinate's distance from
-    /// it in units of the spacing.
+    /// it in units of the spacing; in a periodic grid the node's number is one period up.
     fn locate(&self, coordinate: f64) -> (usize, f64) {
-        let x = (coordinate - self.walls.low) / self.spacing + PADDING as f64;
+        let ahead = if self.periodic { self.side } else { PADDING };
+        let x = (coordinate - self.walls.low) / self.spacing + ahead as f64;
         let first = (x - 0.5) as usize;
         (first, x - first as f64)
     }

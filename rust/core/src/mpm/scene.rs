@@ -32,6 +32,14 @@ const WATER: Material = Material::Water(Water {
     bulk_viscosity: 0.1,
     cohesion: 0.05,
 });
+/// Water with no surface, which may be pulled as it may be pressed.
+const EVERYWHERE: Material = Material::Water(Water {
+    sound_speed: 14.0,
+    exponent: 7.0,
+    viscosity: 0.003,
+    bulk_viscosity: 0.1,
+    cohesion: f64::INFINITY,
+});
 const SAND: Material = Material::Sand(Sand {
     lambda: 350.0,
     mu: 230.0,
@@ -76,6 +84,8 @@ pub enum Scene {
     WaterRamps,
     /// One or two blocks of water above a paddle that turns and swings.
     Stirrer,
+    /// Eddies in water that fills a periodic box, without gravity.
+    Vortices,
 }
 
 /// What is drawn for a scene, at the resolution of its published counterpart.
@@ -109,7 +119,7 @@ struct Block<const D: usize> {
 
 impl Scene {
     /// Every scene, with its name.
-    pub const ALL: [(&'static str, Self); 7] = [
+    pub const ALL: [(&'static str, Self); 8] = [
         ("waterdrop", Self::WaterDrop),
         ("sand", Self::Sand),
         ("goop", Self::Goop),
@@ -117,6 +127,7 @@ impl Scene {
         ("multimaterial", Self::MultiMaterial),
         ("waterramps", Self::WaterRamps),
         ("stirrer", Self::Stirrer),
+        ("vortices", Self::Vortices),
     ];
 
     /// The scene of this name.
@@ -152,7 +163,9 @@ impl Scene {
         seed: u64,
         particles: Option<(usize, usize)>,
     ) -> Result<Simulation<D>, Error> {
-        let recipe = self.recipe();
+        let Some(recipe) = self.recipe() else {
+            return vortices(seed, particles);
+        };
         let spacing = recipe.spacing[D - 2];
         let (low, high) = particles.unwrap_or(recipe.particles[D - 2]);
         let most = (MAX_FILL
@@ -187,8 +200,9 @@ impl Scene {
     }
 
     /// Water's and sand's are chosen so that 30 scenes have the published statistics of
-    /// their counterparts (`benchmarks/generate.py` compares them).
-    fn recipe(self) -> Recipe {
+    /// their counterparts (`benchmarks/generate.py` compares them). None for what is not made of
+    /// blocks.
+    fn recipe(self) -> Option<Recipe> {
         let water = Recipe {
             materials: &[WATER],
             obstacles: |_, _| Vec::new(),
@@ -210,7 +224,7 @@ impl Scene {
             upwards: (-3.5, 0.5),
             ..water
         };
-        match self {
+        Some(match self {
             Self::WaterDrop => water,
             Self::Sand => sand,
             Self::Goop => Recipe {
@@ -248,8 +262,79 @@ impl Scene {
                 blocks: &[0.6, 0.4],
                 ..water
             },
-        }
+            Self::Vortices => return None,
+        })
     }
+}
+
+/// Water that fills the periodic box, with velocities that add up from a few waves across their
+/// directions: free of divergence and of any motion of the whole.
+fn vortices<const D: usize>(
+    seed: u64,
+    particles: Option<(usize, usize)>,
+) -> Result<Simulation<D>, Error> {
+    const ALONG: [usize; 2] = [50, 20];
+    const WAVES: usize = 4;
+    /// Of each wave at its highest \[m/s\].
+    const SPEED: f64 = 0.7;
+    /// Most periods of a wave along an axis.
+    const SHORTEST: usize = 2;
+    let along = ALONG[D - 2];
+    let count = along.pow(D as u32);
+    if let Some((low, high)) = particles
+        && !(low..=high).contains(&count)
+    {
+        return Err(Error::invalid(
+            "particles",
+            format!("got ({low}, {high}), accepted is a range that holds {count}, the full box"),
+        ));
+    }
+    let period = WALLS.high - WALLS.low;
+    let spacing = period / along as f64;
+    let mut rng = Rng::new(seed, Scene::Vortices as u64 * 2 + D as u64);
+    let waves: [_; WAVES] = std::array::from_fn(|_| {
+        let wave = loop {
+            let numbers: [f64; D] =
+                std::array::from_fn(|_| rng.integer(0, 2 * SHORTEST) as f64 - SHORTEST as f64);
+            if numbers.iter().any(|&number| number != 0.0) {
+                break numbers;
+            }
+        };
+        let square: f64 = wave.iter().map(|number| number * number).sum();
+        let drawn: [f64; D] = std::array::from_fn(|_| rng.uniform(-1.0, 1.0));
+        let inward: f64 = drawn.iter().zip(&wave).map(|(a, b)| a * b).sum::<f64>() / square;
+        let across: [f64; D] = std::array::from_fn(|axis| drawn[axis] - inward * wave[axis]);
+        let length = across.iter().map(|a| a * a).sum::<f64>().sqrt();
+        let across = across.map(|a| SPEED * a / length);
+        (wave, across, rng.uniform(0.0, 2.0 * PI))
+    });
+    let filling = (0..count)
+        .map(|index| {
+            let mut remainder = index;
+            let position: [f64; D] = std::array::from_fn(|_| {
+                let step = remainder % along;
+                remainder /= along;
+                WALLS.low + spacing * (step as f64 + 0.5 + rng.uniform(-JITTER, JITTER))
+            });
+            let mut velocity = [0.0; D];
+            for (wave, across, phase) in &waves {
+                let turn: f64 = (wave.iter().zip(&position))
+                    .map(|(number, x)| 2.0 * PI * number * (x - WALLS.low) / period)
+                    .sum();
+                for axis in 0..D {
+                    velocity[axis] += across[axis] * (turn + phase).cos();
+                }
+            }
+            (position, velocity)
+        })
+        .collect();
+    let body = Body {
+        material: EVERYWHERE,
+        particles: filling,
+    };
+    let mut simulation = Simulation::periodic(WALLS, spacing, COARSENESS * spacing, vec![body])?;
+    simulation.separate_fully();
+    Ok(simulation)
 }
 
 /// One to three inclined bars side by side, longer than thick, with room for matter to pass

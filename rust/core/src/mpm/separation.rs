@@ -14,6 +14,7 @@ const DISTANCE: f64 = 0.6;
 /// A search for close pairs on uniform cells, reused from frame to frame.
 pub(crate) struct Separation<const D: usize> {
     walls: Walls,
+    periodic: bool,
     distance: f64,
     cell_width: f64,
     /// Cells along one axis.
@@ -27,12 +28,13 @@ pub(crate) struct Separation<const D: usize> {
 
 impl<const D: usize> Separation<D> {
     /// For particles that are `spacing` apart at rest.
-    pub(crate) fn new(walls: Walls, spacing: f64) -> Self {
+    pub(crate) fn new(walls: Walls, spacing: f64, periodic: bool) -> Self {
         let distance = DISTANCE * spacing;
         let extent = walls.high - walls.low;
         let side = (extent / distance).floor().max(1.0) as usize;
         Self {
             walls,
+            periodic,
             distance,
             cell_width: extent / side as f64,
             side,
@@ -55,7 +57,7 @@ impl<const D: usize> Separation<D> {
                     continue;
                 };
                 for (_, other) in &self.sorted[self.starts[index]..self.starts[index + 1]] {
-                    let arm: [f64; D] = std::array::from_fn(|axis| position[axis] - other[axis]);
+                    let arm = self.arm(&position, other);
                     let square: f64 = arm.iter().map(|a| a * a).sum();
                     if square > 0.0 && square < self.distance.powi(2) {
                         let scale = 0.5 * strength * (self.distance / square.sqrt() - 1.0);
@@ -67,6 +69,19 @@ impl<const D: usize> Separation<D> {
             }
         }
         &self.shifts
+    }
+
+    /// From `other` to `position`, to the nearest image in a periodic box.
+    fn arm(&self, position: &[f64; D], other: &[f64; D]) -> [f64; D] {
+        let period = self.walls.high - self.walls.low;
+        std::array::from_fn(|axis| {
+            let arm = position[axis] - other[axis];
+            if self.periodic {
+                arm - period * (arm / period).round()
+            } else {
+                arm
+            }
+        })
     }
 
     /// Counting sort by cell.
@@ -100,11 +115,17 @@ impl<const D: usize> Separation<D> {
             .fold(0, |index, along| index * self.side + along)
     }
 
-    /// Index of one of the 3^`D` cells around `cell`, if it is inside.
+    /// Index of one of the 3^`D` cells around `cell`, if it is inside; a periodic box, of at least
+    /// three cells along each axis, has no outside.
     fn neighbour(&self, cell: &[usize; D], number: usize) -> Option<usize> {
         let mut remainder = number;
         let mut neighbour = *cell;
         for along in &mut neighbour {
+            if self.periodic {
+                *along = (*along + remainder % 3 + self.side - 1) % self.side;
+                remainder /= 3;
+                continue;
+            }
             *along = (*along + remainder % 3).checked_sub(1)?;
             remainder /= 3;
             if *along >= self.side {
@@ -127,7 +148,9 @@ mod tests {
     #[test]
     fn only_close_pairs_are_shifted_and_equally() {
         let positions = [[0.50, 0.5], [0.53, 0.5], [0.9, 0.1], [0.9, 0.17]];
-        let shifts = Separation::new(WALLS, 0.1).shifts(&positions, 1.0).to_vec();
+        let shifts = Separation::new(WALLS, 0.1, false)
+            .shifts(&positions, 1.0)
+            .to_vec();
         // The pair lacks 0.06 − 0.03, half for each; the other is far enough apart.
         assert!((shifts[0][0] + 0.015).abs() < 1e-12);
         assert!((shifts[1][0] - 0.015).abs() < 1e-12);
@@ -135,8 +158,18 @@ mod tests {
     }
 
     #[test]
+    fn pairs_across_a_periodic_boundary_are_found() {
+        let positions = [[0.01, 0.5], [0.98, 0.5]];
+        let shifts = Separation::new(WALLS, 0.1, true)
+            .shifts(&positions, 1.0)
+            .to_vec();
+        assert!((shifts[0][0] - 0.015).abs() < 1e-12);
+        assert!((shifts[1][0] + 0.015).abs() < 1e-12);
+    }
+
+    #[test]
     fn pairs_across_cells_are_found() {
-        let mut separation = Separation::<3>::new(WALLS, 0.1);
+        let mut separation = Separation::<3>::new(WALLS, 0.1, false);
         for step in 0..100 {
             let x = 0.01 * f64::from(step);
             let positions = [[x, x, 1.0 - x], [x + 0.02, x + 0.02, 1.0 - x - 0.02]];

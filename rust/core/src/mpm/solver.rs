@@ -67,6 +67,10 @@ pub struct Simulation<const D: usize> {
     /// The same of the roughest material that reaches each node; empty where all materials
     /// are equally rough.
     frictions: Vec<f64>,
+    /// Acceleration against the second axis \[m/s²\].
+    gravity: f64,
+    /// Whether what leaves the box on one side comes in on the other.
+    periodic: bool,
     grid: Grid<D>,
     separation: Separation<D>,
     walls: Walls,
@@ -98,6 +102,46 @@ impl<const D: usize> Simulation<D> {
         bodies: Vec<Body<D>>,
         obstacles: Vec<Bar>,
     ) -> Result<Self, Error> {
+        Self::build(
+            walls,
+            particle_spacing,
+            grid_spacing,
+            bodies,
+            obstacles,
+            false,
+        )
+    }
+
+    /// As [`Self::new`], in a periodic box between `walls` that are one and the same place, without
+    /// gravity and obstacles.
+    ///
+    /// # Errors
+    ///
+    /// If a length is not positive and finite, or a position or velocity not finite.
+    pub fn periodic(
+        walls: Walls,
+        particle_spacing: f64,
+        grid_spacing: f64,
+        bodies: Vec<Body<D>>,
+    ) -> Result<Self, Error> {
+        Self::build(
+            walls,
+            particle_spacing,
+            grid_spacing,
+            bodies,
+            Vec::new(),
+            true,
+        )
+    }
+
+    fn build(
+        walls: Walls,
+        particle_spacing: f64,
+        grid_spacing: f64,
+        bodies: Vec<Body<D>>,
+        obstacles: Vec<Bar>,
+        periodic: bool,
+    ) -> Result<Self, Error> {
         const {
             assert!(D == 2 || D == 3);
         }
@@ -123,7 +167,7 @@ impl<const D: usize> Simulation<D> {
         let rough = |body: &Body<D>| body.material.wall_friction();
         let friction = bodies.iter().map(rough).fold(0.0, f64::max);
         let differ = bodies.iter().any(|body| rough(body) != friction);
-        let grid = Grid::new(walls, grid_spacing);
+        let grid = Grid::new(walls, grid_spacing, periodic);
         let frictions = vec![0.0; if differ { grid.nodes.len() } else { 0 }];
         let mut materials = Vec::with_capacity(bodies.len());
         let mut particles = Vec::with_capacity(bodies.iter().map(|b| b.particles.len()).sum());
@@ -154,8 +198,10 @@ impl<const D: usize> Simulation<D> {
             obstacles,
             friction,
             frictions,
+            gravity: if periodic { 0.0 } else { GRAVITY },
+            periodic,
             grid,
-            separation: Separation::new(walls, particle_spacing),
+            separation: Separation::new(walls, particle_spacing, periodic),
             walls,
             particle_spacing,
             volume: particle_spacing.powi(D as i32),
@@ -204,7 +250,7 @@ impl<const D: usize> Simulation<D> {
     pub fn velocities(&self) -> impl ExactSizeIterator<Item = [f64; D]> {
         self.particles.iter().map(|particle| {
             let mut velocity = particle.velocity;
-            velocity[1] -= 0.5 * GRAVITY * self.step;
+            velocity[1] -= 0.5 * self.gravity * self.step;
             velocity
         })
     }
@@ -265,7 +311,7 @@ impl<const D: usize> Simulation<D> {
                     .sum();
                 let per_mass = 0.5 * linalg::dot(&velocity, &velocity)
                     + 0.5 * inertia * spin
-                    + GRAVITY * (particle.position[1] - self.walls.low)
+                    + self.gravity * (particle.position[1] - self.walls.low)
                     + material.energy(&particle.history);
                 self.mass_of(material) * per_mass
             })
@@ -287,7 +333,7 @@ impl<const D: usize> Simulation<D> {
     /// Velocities are those of half a step before: a new step moves that moment, between
     /// which gravity acts.
     fn change_step(&mut self, step: f64) {
-        let kick = -0.5 * GRAVITY * (self.step - step);
+        let kick = -0.5 * self.gravity * (self.step - step);
         for particle in &mut self.particles {
             particle.velocity[1] += kick;
         }
@@ -356,7 +402,7 @@ impl<const D: usize> Simulation<D> {
 
     /// Momentum to velocity, gravity, obstacles, walls.
     fn update_grid(&mut self) {
-        let kick = -GRAVITY * self.step;
+        let kick = -self.gravity * self.step;
         let reach = OBSTACLE_REACH * self.grid.spacing;
         let (poses, common, frictions) = (&self.poses, self.friction, &self.frictions);
         self.grid.for_each_node(|node, place| {
@@ -428,8 +474,17 @@ impl<const D: usize> Simulation<D> {
         }
     }
 
-    /// Out of the obstacles and, above all, inside the walls.
+    /// Out of the obstacles and, above all, inside the walls; in a periodic box to the image inside.
     fn keep_inside(&mut self) {
+        if self.periodic {
+            let (low, period) = (self.walls.low, self.walls.high - self.walls.low);
+            for particle in &mut self.particles {
+                for x in &mut particle.position {
+                    *x = low + (*x - low).rem_euclid(period);
+                }
+            }
+            return;
+        }
         let margin = WALL_MARGIN * self.grid.spacing;
         let (low, high) = (self.walls.low + margin, self.walls.high - margin);
         for particle in &mut self.particles {
