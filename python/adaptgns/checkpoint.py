@@ -21,6 +21,8 @@ from adaptgns.config import TrainConfig, from_json, to_json
 from adaptgns.data.metadata import Metadata
 from adaptgns.simulator import Simulator
 
+PRETRAINED = Path(__file__).parent / "pretrained"
+"""Checkpoints that come with the package, one for each embedded data set, by its name"""
 BEST = "best.safetensors"
 LAST = "last.safetensors"
 FORMAT = "adaptgns-checkpoint-1"
@@ -89,7 +91,8 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 def read_checkpoint(path: Path, *, device: str = "cpu") -> Checkpoint:
     """The checkpoint in the file ``path``, or in the run folder ``path``: its best one, else its
-    last.
+    last. The name of an embedded data set, where there is no such file or folder, stands for the
+    pretrained one.
 
     Raises :class:`CheckpointError` where there is none or it is not whole.
     """
@@ -115,12 +118,16 @@ def read_checkpoint(path: Path, *, device: str = "cpu") -> Checkpoint:
 
 
 def checkpoint_file(path: Path) -> Path:
-    """The checkpoint file that ``path``, a file or a run folder, stands for."""
+    """The checkpoint file that ``path``, a file, a run folder or a pretrained model's name, stands
+    for."""
     candidates = [path] if path.is_file() else [path / BEST, path / LAST]
+    if not path.exists():
+        candidates = [PRETRAINED / f"{path}.safetensors"]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
+    names = ", ".join(sorted(file.stem for file in PRETRAINED.glob("*.safetensors")))
     raise CheckpointError(
-        f"checkpoint {path}: not found; accepted are a .safetensors file and a run folder "
-        f"that holds {BEST} or {LAST}"
+        f"checkpoint {path}: not found; accepted are a .safetensors file, a run folder that holds "
+        f"{BEST} or {LAST}, and the pretrained {names}"
     )

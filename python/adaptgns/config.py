@@ -116,7 +116,7 @@ class RolloutConfig:
     """Rollouts of a trained model over a split."""
 
     checkpoint: Path
-    """Run folder or .safetensors file."""
+    """Run folder or .safetensors file; waterdrop and sand: models that come with the package."""
     out: Path
     """HDF5 file to write."""
     data: str | None = None

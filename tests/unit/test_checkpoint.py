@@ -8,12 +8,15 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from adaptgns._core import simulate
 from adaptgns.checkpoint import (
     BEST,
     LAST,
+    PRETRAINED,
     Checkpoint,
     CheckpointError,
     build_simulator,
@@ -31,6 +34,9 @@ from adaptgns.config import (
     to_json,
 )
 from adaptgns.data.metadata import Metadata
+from adaptgns.data.trajectory import Trajectory
+from adaptgns.policies import Fixed
+from adaptgns.rollout import steps
 
 
 @pytest.fixture
@@ -122,3 +128,28 @@ def test_values_outside_their_range_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=f"{name}: got {value}; accepted are"):
         replace(config, **{name: value})
+
+
+@pytest.mark.parametrize("name", ["waterdrop", "sand"])
+def test_pretrained_models_come_with_the_package(name: str) -> None:
+    checkpoint = read_checkpoint(Path(name))
+    assert checkpoint.config.data == name
+    assert checkpoint.config.out is None
+    assert (PRETRAINED / f"{name}.safetensors").stat().st_size < 2 << 20
+    trajectory = Trajectory("new", *simulate(name, seed=7, frames=300, particles=(200, 300)))
+    simulator = checkpoint.simulator()
+    made = list(steps(simulator, trajectory, Fixed(), 250, teacher_forcing=True))
+    true = np.diff(trajectory.positions.astype(np.float64), n=2, axis=0)
+    nothing = np.square(true / simulator.acceleration_std.numpy()).sum(2).mean()
+    assert np.mean([step.squared_error.mean() for step in made]) < 0.7 * nothing
+
+
+def test_a_folder_goes_before_a_pretrained_model_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("sand").mkdir()
+    with pytest.raises(CheckpointError, match="checkpoint sand: not found"):
+        read_checkpoint(Path("sand"))
+    with pytest.raises(CheckpointError, match="the pretrained sand, waterdrop"):
+        read_checkpoint(Path("snow"))
