@@ -6,7 +6,8 @@
 The plain form is what peers compute: a concatenation of gathered ends, linear layers and a sum by
 ``index_add_``, with the same weights. All forms are timed in turn, round after round, and the
 medians compared. Memory is that of a process that takes one training step, above what it has
-before; on a GPU, the most that tensors take of it. The plot is written beside the results.
+before; on a GPU, the most that tensors take of it. The plot is written to
+docs/images.
 """
 
 from __future__ import annotations
@@ -206,7 +207,7 @@ def draw(results: Path) -> Path:
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel("times as fast as the plain form", fontsize=8)
     figure.axes[1].legend(fontsize=7, frameon=False)
-    picture = results.with_suffix(".png")
+    picture = Path(__file__).parents[1] / "docs" / "images" / f"{results.stem}.png"
     figure.savefig(picture, dpi=200)
     return picture
 
