@@ -76,6 +76,11 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     replace_text(path, json.dumps(json_types(content, digits=6), allow_nan=False) + "\n")
 
 
+def six_digits(value: float) -> float:
+    """``value`` as :func:`write_json` writes it."""
+    return float(f"{value:.6g}")
+
+
 def json_types(value: Any, *, digits: int | None = None) -> Any:
     """``value`` as JSON types, numbers with so many significant ``digits``, and null for those that
     JSON does not know."""

@@ -205,18 +205,15 @@ class Tally:
             self.scalars[f"clumping@{mark}"].append(ratio)
 
     def add_transport(self, truth: Truth, predicted: Floats, marks: Iterable[int]) -> None:
-        """Match the clouds at ``marks``, where that does not take long."""
-        if truth.mobile.sum() > MATCHED:
-            return
+        """Match the clouds at ``marks``, where that does not take long; else it is NaN."""
         for mark in marks:
-            if mark <= len(predicted):
-                cost = transport_cost(
-                    predicted[mark - 1],
-                    truth.positions[mark - 1],
-                    truth.mobile,
-                    truth.metadata.box,
-                )
-                self.scalars[f"transport@{mark}"].append(cost)
+            if mark > len(predicted):
+                continue
+            cost = np.nan
+            if truth.mobile.sum() <= MATCHED:
+                true, box = truth.positions[mark - 1], truth.metadata.box
+                cost = transport_cost(predicted[mark - 1], true, truth.mobile, box)
+            self.scalars[f"transport@{mark}"].append(cost)
 
     def add_density(self, truth: Truth, predicted: Floats) -> None:
         """Count the edges within the data's own radius at every step, whatever the policy."""

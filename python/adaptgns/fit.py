@@ -62,6 +62,10 @@ class TrainingStopped(Exception):  # noqa: N818 (not an error: nothing is lost)
         self.alone = alone
 
 
+class Diverged(TrainingStopped):
+    """It ended since a loss or a weight became infinite or NaN."""
+
+
 class Trainer:
     """A run: its simulator and optimizer, and the step they are at."""
 
@@ -346,10 +350,10 @@ class Trainer:
             raise self._diverged(f"the loss became {mean} in the last {len(losses)} steps")
         return mean
 
-    def _diverged(self, what: str, *, alone: bool = False) -> TrainingStopped:
+    def _diverged(self, what: str, *, alone: bool = False) -> Diverged:
         last = self.folder / LAST
         kept = f"{last} holds the last good state. " if last.exists() else ""
-        return TrainingStopped(
+        return Diverged(
             f"{what}, by step {self.step}. {kept}Look at: the learning rate (--lr, now "
             f"{self.config.lr}), gradient clipping (--clip), and the data "
             f"(python -m adaptgns.inspect {self.config.data})",

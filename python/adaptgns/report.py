@@ -168,7 +168,7 @@ class Column:
 
 
 def _number(value: float | None, spec: str) -> str:
-    return MISSING if value is None else format(value, spec)
+    return MISSING if value is None or not np.isfinite(value) else format(value, spec)
 
 
 def _print_columns(

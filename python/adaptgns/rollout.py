@@ -60,6 +60,8 @@ def steps(
     ``radius`` changes the graph only: features stay divided by the radius the model was trained
     with. With ``teacher_forcing`` every step starts from the true positions.
 
+    Where the positions become infinite or NaN, those of all later steps are NaN.
+
     Raises ValueError for a trajectory or a policy that does not go with the model.
     """
     if policy.needs_sigma and simulator.network.variance_head is None:
@@ -139,8 +141,28 @@ def steps(
             graph_ms=1e3 * (built - started - asking),
             model_ms=1e3 * (finished - built + asking),
         )
+        if not (teacher_forcing or np.isfinite(positions).all()):
+            yield from _lost(positions, sigma, index + 1 - HISTORY, count)
+            return
         newest = true[index] if teacher_forcing else following
         window = torch.cat([window[:, 1:], newest[:, None]], dim=1)
+
+
+def _lost(
+    positions: NDArray[np.float32], sigma: NDArray[np.float32] | None, done: int, count: int
+) -> Iterator[Step]:
+    """The steps after the ``done`` first of ``count``, of particles whose positions are no longer
+    finite: there is no graph of them."""
+    nothing = np.full(len(positions), np.nan, np.float32)
+    for _ in range(done, count):
+        yield Step(
+            positions=np.full_like(positions, np.nan),
+            sigma=None if sigma is None else nothing,
+            squared_error=nothing,
+            edges=0,
+            graph_ms=0.0,
+            model_ms=0.0,
+        )
 
 
 def to_sigma(prediction: Prediction) -> NDArray[np.float32]:

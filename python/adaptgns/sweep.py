@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -44,6 +45,8 @@ from adaptgns.rollout import steps
 from adaptgns.simulator import Simulator
 
 JOURNAL, RESULT, HEAT_MAP = "journal.log", "sweep.json", "sweep"
+Combination = tuple[tuple[str, float], ...]
+
 DRAWN = 30
 """Trials of the samplers that draw, unless asked otherwise"""
 
@@ -114,15 +117,10 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
     study = optuna.create_study(
         study_name="adaptgns",
         storage=_storage(config),
-        sampler=_sampler(config, space),
+        sampler=_sampler(config),
         load_if_exists=True,
     )
     _refuse_other(study, config)
-    if config.sampler == "grid":
-        combinations = math.prod(map(len, space.values()))
-        wanted = min(combinations, config.trials or combinations)
-    else:
-        wanted = config.trials or DRAWN
 
     def objective(trial: optuna.Trial) -> float:
         found = measure(simulator, split, config, **_suggest(trial, config, space))
@@ -133,10 +131,12 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
         error = found["mse"]
         return error if math.isfinite(error) else 1e9  # which samplers can compare
 
-    def count() -> int:
-        return len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-
-    while (done := count()) < wanted:
+    wanted = config.trials or DRAWN
+    if config.sampler == "grid":
+        wanted = min(math.prod(map(len, space.values())), config.trials or sys.maxsize)
+    while (done := len(_complete(study))) < wanted:
+        if config.sampler == "grid":
+            study.enqueue_trial(_next_combination(study, space))
         study.optimize(objective, n_trials=1)
         trial = study.trials[-1]
         console.print(
@@ -145,7 +145,7 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
             f"{trial.user_attrs.get('edges', math.nan):,.0f} edges a step",
             highlight=False,
         )
-    trials = study.get_trials(states=(TrialState.COMPLETE,))
+    trials = list(_complete(study).values())
     result = _result(config, trials)
     write_json(config.out / RESULT, result)
     with mpl.rc_context(STYLE):  # type: ignore[arg-type]
@@ -186,26 +186,39 @@ def measure(
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
+def _complete(study: optuna.Study) -> dict[Combination, FrozenTrial]:
+    """The trials that have ended well, one of each combination."""
+    ended = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    return {tuple(sorted(trial.params.items())): trial for trial in ended}
+
+
+def _next_combination(study: optuna.Study, space: dict[str, tuple[float, ...]]) -> dict[str, float]:
+    """One that has not been tried; rather one that nobody seems to be at, but an interrupted trial
+    may look so for ever."""
+    done = _complete(study)
+    running = study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+    taken = {tuple(sorted(trial.params.items())) for trial in running}
+    grid = [dict(zip(space, values, strict=True)) for values in product(*space.values())]
+    left = [each for each in grid if tuple(sorted(each.items())) not in done]
+    free = [each for each in left if tuple(sorted(each.items())) not in taken]
+    return (free or left)[0]
+
+
 def _storage(config: SweepConfig) -> JournalStorage | RDBStorage:
     if config.storage is not None:
         return RDBStorage(config.storage)
     return JournalStorage(JournalFileBackend(str(config.out / JOURNAL)))
 
 
-def _sampler(
-    config: SweepConfig, space: dict[str, tuple[float, ...]]
-) -> optuna.samplers.BaseSampler:
+def _sampler(config: SweepConfig) -> optuna.samplers.BaseSampler:
     seed = config.seed + os.getpid()  # several processes draw different ones
     match config.sampler:
-        case "grid":
-            grid = {name: list(values) for name, values in space.items()}
-            return optuna.samplers.GridSampler(grid, seed=config.seed)
         case "tpe":
             return optuna.samplers.TPESampler(seed=seed)
-        case "random":
-            return optuna.samplers.RandomSampler(seed=seed)
         case "cmaes":
             return optuna.samplers.CmaEsSampler(seed=seed)
+        case _:  # of a grid each combination is named
+            return optuna.samplers.RandomSampler(seed=seed)
 
 
 def _suggest(
@@ -236,9 +249,16 @@ def _refuse_other(study: optuna.Study, config: SweepConfig) -> None:
 
 def _result(config: SweepConfig, trials: Sequence[FrozenTrial]) -> dict[str, Any]:
     rows = sorted(
-        ({**trial.params, **trial.user_attrs} for trial in trials), key=lambda row: row["mse"]
+        ({**trial.params, **trial.user_attrs} for trial in trials),
+        key=lambda row: row["mse"] if math.isfinite(row["mse"]) else math.inf,
     )
-    within = [row for row in rows if config.edges is None or row["edges"] <= config.edges]
+    within = [
+        row
+        for row in rows
+        if math.isfinite(row["mse"]) and (config.edges is None or row["edges"] <= config.edges)
+    ]
+    if not within and config.edges is None:
+        raise ValueError("every trial diverged; look at the model, or at fewer --steps")
     if not within:
         fewest = min(row["edges"] for row in rows)
         raise ValueError(

@@ -7,6 +7,7 @@ interrupted goes on. Then it writes one report whose every number comes from the
 from __future__ import annotations
 
 import fnmatch
+import glob
 import os
 import platform
 import subprocess
@@ -24,7 +25,7 @@ from rich.console import Console
 from adaptgns.atomic import write_json
 from adaptgns.command import plain_errors
 from adaptgns.config import Device, torch_device
-from adaptgns.fit import TrainingStopped
+from adaptgns.fit import Diverged, TrainingStopped
 from adaptgns.fused import divide_threads
 from adaptgns.interruption import interruption
 from adaptgns.reproduce import report
@@ -103,25 +104,42 @@ def reproduce(config: ReproduceConfig, console: Console) -> None:
 
 
 def make(config: ReproduceConfig, study: Study, runs: Sequence[Run], console: Console) -> None:
-    """Make those of ``runs`` that are missing, and what is measured beside them."""
+    """Make those of ``runs`` that are missing, and what is measured beside them.
+
+    A run that fails does not keep the others from being made; RuntimeError names it at the end.
+    """
     if study.threads is not None and torch_device(study.device).type == "cpu":
         divide_threads(study.threads)
+    whole = config.only == "*"
     for data in study.sets.values():
         data.describe()
-        data.pass_gate(console)
+        if whole:  # of several that share a study, the gate is one's to pass
+            data.pass_gate(console)
     todo = [run for run in runs if not run.done]
-    if config.jobs == 1:
-        for run in todo:
-            run.do(console)
-    else:
-        in_processes(config, todo, console)
-    seed = study.profile.seeds[0]
-    for data in study.sets.values():
-        first = [run for run in study.runs() if (run.data, run.seed) == (data, seed)]
-        if all(run.done for run in first):
-            data.time_steps(first)
+    failed = (one_by_one if config.jobs == 1 else in_processes)(config, todo, console)
     if todo:
         write_json(study.out / "machine.json", _machine())
+    if failed:
+        raise RuntimeError(
+            f"{len(failed)} runs failed: {', '.join(failed)}. Repeat the command to go on"
+        )
+    seed = study.profile.seeds[0]
+    for data in study.sets.values() if whole else ():
+        data.time_steps([run for run in study.runs() if (run.data, run.seed) == (data, seed)])
+
+
+def one_by_one(config: ReproduceConfig, runs: Sequence[Run], console: Console) -> list[str]:
+    """Make ``runs`` here; the names of those that failed, for reasons that are printed."""
+    failed = []
+    for run in runs:
+        try:
+            run.do(console)
+        except (ValueError, RuntimeError, Diverged) as error:
+            if len(runs) == 1:
+                raise
+            console.print(f"{run.name}: {error}", markup=False, highlight=False)
+            failed.append(run.name)
+    return failed
 
 
 def list_runs(runs: Sequence[Run], console: Console) -> None:
@@ -141,11 +159,9 @@ def list_runs(runs: Sequence[Run], console: Console) -> None:
     console.print(f"{'together':40} {total:8.2f} h, one after the other", highlight=False)
 
 
-def in_processes(config: ReproduceConfig, runs: Sequence[Run], console: Console) -> None:
-    """Make ``runs`` in processes of their own, ``config.jobs`` at a time.
-
-    A run that fails does not keep the others from being made; RuntimeError names it at the end.
-    """
+def in_processes(config: ReproduceConfig, runs: Sequence[Run], console: Console) -> list[str]:
+    """Make ``runs`` in processes of their own, ``config.jobs`` at a time; the names of those that
+    failed, whose logs say why."""
     waiting, failed = list(runs), []
     running: dict[subprocess.Popen[bytes], Run] = {}
     gpus = torch.cuda.device_count() if config.device != "cpu" else 0
@@ -187,11 +203,7 @@ def in_processes(config: ReproduceConfig, runs: Sequence[Run], console: Console)
                     f"stopped by {interrupted[0]}; nothing is lost. Repeat the command to go on"
                 )
             time.sleep(0.2)
-    if failed:
-        raise RuntimeError(
-            f"{len(failed)} runs failed: {', '.join(failed)}; their logs say why. Repeat the "
-            "command to go on"
-        )
+    return failed
 
 
 def _command(config: ReproduceConfig, run: Run) -> list[str]:
@@ -199,7 +211,14 @@ def _command(config: ReproduceConfig, run: Run) -> list[str]:
     return [
         *(sys.executable, "-m", "adaptgns.reproduce"),
         *("--preset", study.preset, "--data", *config.data, "--out", str(study.out)),
-        *("--only", run.name, "--device", config.device, "--threads", str(study.threads)),
+        *(
+            "--only",
+            glob.escape(run.name),
+            "--device",
+            config.device,
+            "--threads",
+            str(study.threads),
+        ),
     ]
 
 

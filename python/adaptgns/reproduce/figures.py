@@ -20,10 +20,11 @@ from adaptgns import figures
 from adaptgns.figures import BASELINE, DASHES, MARKERS, STYLE, save
 from adaptgns.graph import adaptive_graph
 from adaptgns.palette import SERIES, SIGMA_MAP
+from adaptgns.periodic import minimum_image
 from adaptgns.reproduce.profiles import ADAPTIVE
 from adaptgns.reproduce.results import Results, Series
 from adaptgns.reproduce.runs import DataSet
-from adaptgns.reproduce.tables import series_label
+from adaptgns.reproduce.tables import matched, series_label
 
 COLOURS = {
     "mse": SERIES[0],
@@ -114,11 +115,23 @@ def _graphs(results: Results, snapshots: dict[str, Any]) -> Figure:
     figure, (panels,) = _panels(len(snapshots), 3.2)
     for ax, (name, frames) in zip(panels, snapshots.items(), strict=True):
         positions, sigma = frames["predicted"][-1], frames["sigma"][-1]
+        box, mobile = frames["box"], frames["mobile"]
+        period = box if np.isfinite(box).any() else None
         radius = results.study.sets[name].described["radius"]
-        edges = adaptive_graph(positions, sigma, radius, ADAPTIVE.tau, ADAPTIVE.factor)
+        edges = adaptive_graph(
+            positions,
+            sigma,
+            radius,
+            ADAPTIVE.tau,
+            ADAPTIVE.factor,
+            box=period,
+            eligible=mobile,
+        )
         edges = edges[:, edges[0] < edges[1]]
-        ends = positions[edges][..., :2]  # [2, E, d]
-        far = np.linalg.norm(ends[0] - ends[1], axis=1) > radius
+        ends = positions[edges]  # [2, E, d]
+        apart = minimum_image(ends[1] - ends[0], period)
+        ends = np.stack([ends[0], ends[0] + apart])[..., :2]
+        far = np.linalg.norm(apart, axis=1) > radius
         for chosen, tint, width in ((~far, BASE_EDGE, 0.35), (far, EXTRA_EDGE, 0.5)):
             lines = ends[:, chosen].transpose(1, 0, 2)
             ax.add_collection(LineCollection(list(lines), colors=tint, linewidths=width))
@@ -194,7 +207,7 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                 error = series.estimate(f"mse@{mark}")
                 cost = series.scalar("edges_per_step").mean()
                 if unit.startswith("milli"):
-                    time = data.times[f"{series.model.name}, {series.policy}"]
+                    time = data.times["times"][f"{series.model.name}, {series.policy}"]
                     cost = time["graph_ms"] + time["model_ms"]
                 ax.errorbar(
                     cost,
@@ -256,7 +269,7 @@ def _clouds(results: Results, sets: list[DataSet]) -> Figure:
             if series is None:
                 continue
             _band(energy, series.curve("kinetic_energy"), series)
-            values = [series.estimate(f"transport@{mark}").mean for mark in marks]
+            values = [matched(series, mark).mean for mark in marks]
             transport.plot(
                 marks,
                 values,

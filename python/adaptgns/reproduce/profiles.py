@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from adaptgns.atomic import six_digits
 from adaptgns.config import AdaptiveConfig, Loss, PolicyName, TrainConfig
 from adaptgns.data.generation import SplitPlan
 from adaptgns.presets import PRESETS
@@ -59,13 +60,13 @@ class Model:
             adaptive=ADAPTIVE,
             variance_weight=self.variance_weight,
             variance_ahead=self.variance_ahead,
-            unroll=max(2, base.unroll) if self.variance_ahead else base.unroll,
+            unroll=max(2, base.unroll) if self.loss == "decoupled" else base.unroll,
             steps=max(1, round(self.share * base.steps)),
             model=replace(
                 base.model,
                 edges=self.edges,
                 variance_layers=self.variance_layers,
-                radius=None if factor == 1.0 else round(factor * radius, 6),
+                radius=None if factor == 1.0 else six_digits(factor * radius),
             ),
         )
 

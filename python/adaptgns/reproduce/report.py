@@ -64,7 +64,12 @@ def write_into(study: Study, readme: Path) -> None:
     parts = [_made(study)]
     for table in tables(Results(study)):
         if table.name.startswith("rollouts"):
-            kept = [0, 1, 2, 3, 7]  # the columns that say it; the report has them all
+            kept = [
+                0,
+                1,
+                *range(2, 3 + len(study.profile.marks)),
+                -3,
+            ]  # the columns that say it; the report has them all
             rows = [Row([row.cells[i] for i in kept]) for row in table.rows]
             short = Table(table.name, table.title, [table.columns[i] for i in kept], rows)
             parts.append(f"**{table.title}**\n\n{_table(short)}")

@@ -13,19 +13,21 @@ policies, and measures that. Files in the study's folder:
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
-from adaptgns.atomic import write_json, written_whole
-from adaptgns.checkpoint import LAST, read_checkpoint
+from adaptgns.atomic import six_digits, write_json, written_whole
+from adaptgns.checkpoint import LAST, Checkpoint, read_checkpoint
 from adaptgns.config import (
     HISTORY,
     AdaptiveConfig,
@@ -40,9 +42,9 @@ from adaptgns.config import (
 from adaptgns.data.default import EMBEDDED, dataset_folder
 from adaptgns.data.generation import generate_dataset
 from adaptgns.data.metadata import Metadata, read_metadata
-from adaptgns.data.trajectories import open_split
+from adaptgns.data.trajectories import Trajectories, open_split
 from adaptgns.evaluate import STATISTICS_STEP, measure
-from adaptgns.graph_statistics import graph_statistics
+from adaptgns.graph_statistics import GraphStatistics, graph_statistics
 from adaptgns.policies import make_policy
 from adaptgns.processes import ALONE
 from adaptgns.reproduce.profiles import ADAPTIVE, DENSER, MSE, NLL, Model, Profile, ProfileName
@@ -50,6 +52,8 @@ from adaptgns.rollout import Step, steps, write_rollouts
 from adaptgns.rollout_file import RolloutFile
 from adaptgns.sweep import RESULT, SweepConfig, sweep
 from adaptgns.train import train
+
+Split = Literal["train", "valid", "test"]
 
 SNAPSHOTS = (1, 10, 50, 100)
 """Steps whose frames are kept for the figures"""
@@ -139,43 +143,65 @@ class DataSet:
         return read_metadata(self.folder)
 
     def describe(self) -> None:
-        """Measure the true graphs, for table 2, and what the policy knn takes its k from."""
+        """Measure the true graphs, for table 2, and what the policy knn takes its k from.
+
+        StudyError where that has been done of other data.
+        """
         path = self.metrics / "data.json"
+        fingerprint = self._fingerprint()
         if path.exists():
+            if read_json(path).get("fingerprint") != fingerprint:
+                raise StudyError(
+                    f"{path}: describes other data than those in {self.folder}. Give another --out"
+                )
             return
-        metadata, evolution, statistics = self.metadata, [], []
-        test = open_split(self.folder, "test")
+        metadata, marks = self.metadata, self.study.profile.marks
+        test, valid = (open_split(self.folder, split) for split in ("test", "valid"))
         shortest = min(int(test.lengths.min()) - HISTORY, STATISTICS_STEP)
-        for trajectory in test:
-            frames = trajectory.positions[HISTORY - 1 :]
-            statistics.append(
-                asdict(graph_statistics(frames[shortest], metadata.radius, metadata.box))
-            )
-            evolution.append(
-                [
-                    asdict(graph_statistics(frame, metadata.radius, metadata.box))
-                    for frame in frames[::EVERY]
+
+        def courses(split: Trajectories) -> Iterator[NDArray[np.float32]]:
+            """Positions ``[1 + steps, N, d]`` from the last that a rollout is given."""
+            return (trajectory.positions[HISTORY - 1 :] for trajectory in split)
+
+        def statistics(frame: NDArray[np.float32]) -> GraphStatistics:
+            return graph_statistics(frame, metadata.radius, metadata.box)
+
+        content = {
+            "fingerprint": fingerprint,
+            "radius": metadata.radius,
+            "step": shortest,
+            "statistics": [asdict(statistics(frames[shortest])) for frames in courses(test)],
+            "evolution_every": EVERY,
+            "evolution": [
+                [asdict(statistics(frame)) for frame in frames[::EVERY]] for frames in courses(test)
+            ],
+            "valid_degree": float(
+                np.mean(
+                    [statistics(f).degree for frames in courses(valid) for f in frames[::EVERY]]
+                )
+            ),
+            # The error of putting every particle at the true centre of all.
+            "centroid_mse": {
+                str(mark): [
+                    float(frames[mark].var(axis=0, dtype=np.float64).mean())
+                    if mark < len(frames)
+                    else math.nan
+                    for frames in courses(test)
                 ]
-            )
-        valid = open_split(self.folder, "valid")
-        degrees = [
-            graph_statistics(
-                trajectory.positions[HISTORY - 1 :: EVERY][step], metadata.radius, metadata.box
-            ).degree
-            for trajectory in valid
-            for step in range(len(trajectory.positions[HISTORY - 1 :: EVERY]))
-        ]
-        write_json(
-            path,
-            {
-                "radius": metadata.radius,
-                "step": shortest,
-                "statistics": statistics,
-                "evolution_every": EVERY,
-                "evolution": evolution,
-                "valid_degree": float(np.mean(degrees)),
+                for mark in marks
             },
-        )
+        }
+        write_json(path, content)
+
+    def _fingerprint(self) -> str:
+        """Tells data apart by their metadata, sizes, and the ends of each split."""
+        digest = hashlib.sha256(json.dumps(self.metadata.to_json(), sort_keys=True).encode())
+        for name in ("train", "valid", "test"):
+            split = open_split(self.folder, name)
+            digest.update(np.array([split.lengths, split.particle_counts], np.int64).tobytes())
+            for index in (0, len(split) - 1):
+                digest.update(split[index].positions.tobytes())
+        return digest.hexdigest()[:16]
 
     @property
     def described(self) -> dict[str, Any]:
@@ -192,45 +218,55 @@ class DataSet:
 
     @property
     def rule(self) -> dict[str, float]:
-        """What the sweep chose."""
-        chosen: dict[str, float] = read_json(self.metrics / "sweep" / RESULT)["chosen"]
+        """What the sweep chose. StudyError where it is missing or was another one."""
+        path = self.metrics / "sweep" / RESULT
+        content = read_json(path)
+        config = self._sweep_config(content["settings"]["edges"])
+        asked = json.loads(json.dumps(to_json(config)))
+        for name, value in content["settings"].items():
+            if asked[name] != value:
+                raise StudyError(
+                    f"{path}: was made with {name} {value}; the study has {asked[name]}. Remove "
+                    "its folder, or give another --out"
+                )
+        chosen: dict[str, float] = content["chosen"]
         return chosen
+
+    def _sweep_config(self, budget: float) -> SweepConfig:
+        profile, radius = self.study.profile, float(self.described["radius"])
+        return SweepConfig(
+            checkpoint=Run(self, NLL, profile.seeds[0]).folder,
+            out=self.metrics / "sweep",
+            tau=profile.sweep.tau,
+            factor=profile.sweep.factor,
+            radius=tuple(six_digits(share * radius) for share in profile.sweep.radius),
+            edges=budget,
+            steps=self.study.last_mark,
+            trajectories=profile.sweep.trajectories,
+            device=self.study.device,
+        )
 
     def choose_rule(self, console: Console) -> None:
         """Sweep the adaptive rule on validation, with the NLL model of the first seed, within the
         edges that the fixed graph of the MSE model has there."""
-        folder = self.metrics / "sweep"
-        if (folder / RESULT).exists():
+        if (self.metrics / "sweep" / RESULT).exists():
             return
-        profile, radius = self.study.profile, float(self.described["radius"])
-        seed = profile.seeds[0]
-        run = Run(self, NLL, seed)
-        run.require_training()
-        count = profile.sweep.trajectories
+        profile = self.study.profile
+        seed, count = profile.seeds[0], profile.sweep.trajectories
+        Run(self, NLL, seed).require_training()
         budget = valid_edges(self, MSE, seed, "fixed", trajectories=count)
-        sweep(
-            SweepConfig(
-                checkpoint=run.folder,
-                out=folder,
-                data=str(self.folder),
-                tau=profile.sweep.tau,
-                factor=profile.sweep.factor,
-                radius=tuple(round(share * radius, 6) for share in profile.sweep.radius),
-                edges=budget,
-                steps=self.study.last_mark,
-                trajectories=count,
-                device=self.study.device,
-            ),
-            console,
-        )
+        sweep(replace(self._sweep_config(budget), data=str(self.folder)), console)
 
     def time_steps(self, runs: Sequence[Run]) -> None:
         """Time a step under every model and policy in ``runs``, in turns, on true positions of one
         test trajectory."""
         path = self.metrics / "times.json"
-        if path.exists():
+        names = {f"{run.model.name}, {policy}" for run in runs for policy in run.model.policies}
+        if path.exists() and names <= set(read_json(path)["times"]):
             return
-        trajectory = open_split(self.folder, "test")[0]
+        test = open_split(self.folder, "test")
+        sizes = test.particle_counts
+        trajectory = test[int(np.argmin(np.abs(sizes - np.median(sizes))))]
         start = max(0, min(STATISTICS_STEP, len(trajectory.positions) - HISTORY - TIMED))
         trajectory = replace(trajectory, positions=trajectory.positions[start:])
         count = min(TIMED, len(trajectory.positions) - HISTORY)
@@ -255,17 +291,21 @@ class DataSet:
         write_json(
             path,
             {
-                name: {
-                    kind: float(np.median([getattr(step, kind) for step in taken]))
-                    for kind in ("graph_ms", "model_ms", "edges")
-                }
-                for name, taken in times.items()
+                "particles": len(trajectory.particle_type),
+                "threads": self.study.threads,
+                "times": {
+                    name: {
+                        kind: float(np.median([getattr(step, kind) for step in taken]))
+                        for kind in ("graph_ms", "model_ms", "edges")
+                    }
+                    for name, taken in times.items()
+                },
             },
         )
 
     @property
-    def times(self) -> dict[str, dict[str, float]]:
-        """What :meth:`time_steps` measured."""
+    def times(self) -> dict[str, Any]:
+        """What :meth:`time_steps` measured: by model and policy, and on what."""
         return read_json(self.metrics / "times.json")
 
     def pass_gate(self, console: Console) -> None:
@@ -279,7 +319,12 @@ class DataSet:
             run = Run(self, model, profile.seeds[0])
             run.train(console)
             row = run.measured("fixed", split="valid", console=console)["rollouts"][0]
-            ratio = row["scalars"][f"clumping@{self.study.last_mark}"]["mean"]
+            mark = f"clumping@{self.study.last_mark}"
+            if mark not in row["scalars"]:
+                raise StudyError(
+                    f"{self.name}: no validation trajectory reaches step {self.study.last_mark}"
+                )
+            ratio = row["scalars"][mark]["mean"]
             ratios[str(steps)] = ratio
             passed = ratio is not None and ratio <= profile.gate
             if passed or 2 * steps > profile.gate_steps:
@@ -318,9 +363,10 @@ class Run:
             return self.model
         return next(m for m in self.study.profile.models if m.name == self.model.weights)
 
-    def metrics(self, policy: PolicyName) -> Path:
+    def metrics(self, policy: PolicyName, split: Split = "test") -> Path:
         """What was measured under ``policy``."""
-        return self.data.metrics / f"{self.model.name}-{self.seed}-{policy}.json"
+        ending = "" if split == "test" else f"-{split}"
+        return self.data.metrics / f"{self.model.name}-{self.seed}-{policy}{ending}.json"
 
     @property
     def done(self) -> bool:
@@ -374,12 +420,26 @@ class Run:
             write_json(self.metrics(policy), content)
 
     def require_training(self) -> None:
-        """Raise StudyError where what it builds on has not been trained."""
-        if not (self.folder / LAST).exists():
+        """Raise StudyError unless its training is done."""
+        name = f"{self.data.name}/{self.trained.name}-{self.seed}"
+        last = self.folder / LAST
+        if not last.exists():
+            raise StudyError(f"{self.name}: needs {name}, which is missing")
+        checkpoint = self._own(last)
+        if checkpoint.step < checkpoint.config.steps or not checkpoint.validated:
             raise StudyError(
-                f"{self.name}: needs {self.data.name}/{self.trained.name}-{self.seed}, which is "
-                "missing"
+                f"{self.name}: needs {name}, which is at step {checkpoint.step} of "
+                f"{checkpoint.config.steps}"
             )
+
+    def _own(self, last: Path) -> Checkpoint:
+        """The checkpoint ``last``. StudyError where it is of another configuration or of other
+        data."""
+        checkpoint = read_checkpoint(last)
+        refuse_difference(str(last), checkpoint.config, self.config())
+        if checkpoint.metadata != self.data.metadata:
+            raise StudyError(f"{last}: was trained on other data. Remove it, or give another --out")
+        return checkpoint
 
     def train(self, console: Console) -> None:
         """Train to the end, from where it was left."""
@@ -392,9 +452,8 @@ class Run:
         )
         last = self.folder / LAST
         if last.exists():
-            checkpoint = read_checkpoint(last)
-            refuse_difference(str(last), checkpoint.config, config)
-            if checkpoint.step == config.steps:
+            checkpoint = self._own(last)
+            if checkpoint.step == config.steps and checkpoint.validated:
                 return
             config = replace(config, resume=self.folder)
         console.print(f"{self.name}: training", highlight=False)
@@ -405,14 +464,12 @@ class Run:
         policy: PolicyName,
         *,
         console: Console,
-        split: str = "test",
+        split: Split = "test",
         snapshot: bool = False,
     ) -> dict[str, Any]:
         """Roll out under ``policy``, and measure; the report as JSON, of which nothing tells where
         it was made."""
-        values = {**to_json(self.rollout_config(policy)), "split": split}
-        values["data"] = str(self.data.folder)
-        config = from_json(RolloutConfig, values, source=self.name)
+        config = replace(self.rollout_config(policy), split=split, data=str(self.data.folder))
         console.print(f"{self.name}: {split}, {policy}", highlight=False)
         write_rollouts(config, console)
         content = measure([config.out], self.study.profile.marks).to_json()
@@ -426,24 +483,30 @@ class Run:
                 for name in ("out", "checkpoint", "resume"):
                     settings.pop(name, None)
                 settings["data"] = self.data.name
+        content["data_fingerprint"] = self.data.described["fingerprint"]
         return content
 
-    def read(self, policy: PolicyName) -> dict[str, Any]:
-        """The row of metrics of the test split under ``policy``.
+    def read(self, policy: PolicyName, split: Split = "test") -> dict[str, Any]:
+        """The row of metrics of a split under ``policy``.
 
-        StudyError where it is missing, or its configuration is not that of this run.
+        StudyError where it is missing, or not what this run would measure.
         """
-        path = self.metrics(policy)
+        path = self.metrics(policy, split)
         if not path.exists():
             raise StudyError(
                 f"{path}: missing; run `python -m adaptgns.reproduce --preset {self.study.preset} "
                 f"--only '{self.name}'`"
             )
-        row: dict[str, Any] = read_json(path)["rollouts"][0]
+        content = read_json(path)
+        if content["data_fingerprint"] != self.data.described["fingerprint"]:
+            raise StudyError(f"{path}: was measured on other data. Remove it")
+        if content["marks"] != sorted(self.study.profile.marks):
+            raise StudyError(f"{path}: was measured at other steps, {content['marks']}. Remove it")
+        row: dict[str, Any] = content["rollouts"][0]
         settings = row["settings"]
         trained = from_json(TrainConfig, settings["training"], source=str(path))
         refuse_difference(str(path), trained, self.config())
-        asked = self.rollout_config(policy)
+        asked = replace(self.rollout_config(policy), split=split)
         # What older files lack has its default.
         known = {name: settings[name] for name in to_json(asked) if name in settings}
         local = {"checkpoint": "", "out": ""}
@@ -463,7 +526,7 @@ def matched_radius(data: DataSet, seed: int, radius: float) -> float:
     adaptive = valid_edges(data, NLL, seed, "adaptive")
     share = (adaptive - sparse) / (dense - sparse) if dense != sparse else 0.0
     squared = radius**2 * (1 + min(max(share, 0.0), 1.0) * (DENSER**2 - 1))
-    return round(math.sqrt(squared), 6)
+    return six_digits(math.sqrt(squared))
 
 
 def valid_edges(
@@ -472,12 +535,12 @@ def valid_edges(
     """Edges per step of a model's rollouts of the validation split, which are made once; of its
     first ``trajectories``, or all."""
     run = Run(data, model, seed)
-    path = data.metrics / f"{model.name}-{seed}-{policy}-valid.json"
+    path = run.metrics(policy, "valid")
     if not path.exists():
         run.require_training()
         write_json(path, run.measured(policy, split="valid", console=Console(quiet=True)))
-    edges = read_json(path)["rollouts"][0]["scalars"]["edges_per_step"]["per_trajectory"]
-    return float(np.mean(edges[:trajectories]))
+    edges = run.read(policy, "valid")["scalars"]["edges_per_step"]["per_trajectory"]
+    return float(np.mean(np.array(edges[:trajectories], dtype=np.float64)))
 
 
 def refuse_difference(path: str, made: object, wanted: object) -> None:
@@ -493,7 +556,7 @@ def refuse_difference(path: str, made: object, wanted: object) -> None:
 
 def write_snapshot(rollouts: Path, path: Path) -> None:
     """Keep frames of the first trajectory in ``rollouts``: positions ``[S, N, d]`` and sigma
-    ``[S, N]`` after the steps ``[S]``."""
+    ``[S, N]`` after the steps ``[S]``, and what the graph is made with besides."""
     with RolloutFile(rollouts) as file:
         rollout = file[0]
         steps = [step for step in SNAPSHOTS if step <= rollout.steps]
@@ -502,6 +565,10 @@ def write_snapshot(rollouts: Path, path: Path) -> None:
             "steps": np.array(steps),
             "predicted": rollout.predicted[rows],
             "true": rollout.true[rows],
+            "mobile": file.metadata.mobile(rollout.particle_type),
+            "box": np.full(file.metadata.dim, np.inf)
+            if file.metadata.box is None
+            else file.metadata.box,
         }
         sigma = rollout.sigma
         if sigma is not None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptgns.config import PolicyName
-from adaptgns.reproduce.results import Estimate, Results, Series
+from adaptgns.evaluate import MATCHED
+from adaptgns.reproduce.results import Estimate, Results, Series, estimate
 from adaptgns.reproduce.runs import EVERY, DataSet, read_json
 from adaptgns.sweep import RESULT
 
@@ -156,8 +157,8 @@ def _statistics(results: Results) -> Table:
 
 
 def _rollouts(results: Results, data: DataSet) -> Table:
-    mark = results.study.last_mark
-    rows, times = [], data.times
+    mark, marks = results.study.last_mark, results.study.profile.marks
+    rows, times = [], data.times["times"]
     where = str((data.metrics / "times.json").relative_to(results.study.out).as_posix())
     for series in results.of(data.name):
         time = times[f"{series.model.name}, {series.policy}"]
@@ -168,13 +169,13 @@ def _rollouts(results: Results, data: DataSet) -> Table:
                 [
                     series.model.title,
                     series.policy if series.model.edges else MISSING,
-                    _interval(series.estimate(f"mse@{mark}"), ".2e"),
+                    *(_interval(series.estimate(f"mse@{each}"), ".2e") for each in marks),
                     _interval(series.estimate("edges_per_step"), ",.0f")
                     if series.model.edges
                     else "0",
-                    f"{predicted:,.0f}",
-                    f"{true:,.0f}",
-                    f"{predicted / true:.2f}",
+                    _number(predicted, ",.0f"),
+                    _number(true, ",.0f"),
+                    _number(predicted / true, ".2f"),
                     _interval(series.estimate(f"clumping@{mark}"), ".2f"),
                     f"{time['graph_ms']:.2f}",
                     f"{time['model_ms']:.2f}",
@@ -182,13 +183,26 @@ def _rollouts(results: Results, data: DataSet) -> Table:
                 [*series.files, where],
             )
         )
+    count = results.study.profile.trajectories
+    centre = [
+        np.array(data.described["centroid_mse"][str(each)][:count], dtype=np.float64)
+        for each in marks
+    ]
+    rows.append(
+        Row(
+            ["all particles at their true centre", MISSING]
+            + [_interval(estimate(each[None]), ".2e") for each in centre]
+            + [MISSING] * 7,
+            [str((data.metrics / "data.json").relative_to(results.study.out).as_posix())],
+        )
+    )
     return Table(
         f"rollouts-{data.name}",
         f"Rollouts on {data.name} (table 4)",
         (
             "model",
             "graph",
-            f"MSE@{mark}",
+            *(f"MSE@{each}" for each in marks),
             "edges a step",
             "edges within r, predicted",
             "true",
@@ -198,53 +212,70 @@ def _rollouts(results: Results, data: DataSet) -> Table:
             "model ms",
         ),
         rows,
-        "Means over seeds and trajectories, in brackets the 95 % interval of a bootstrap over "
-        "both. Edges are directed and without self-edges. The ratio is that of edges within the "
-        "data's radius on predicted over true positions: above 1, the predicted particles clump. "
-        "Milliseconds of a step are medians of all models and policies in turns, on the same true "
-        "positions.",
+        "Means over seeds and trajectories, in brackets the 95 % interval for both as samples "
+        "(adaptgns.reproduce.results). Edges are directed and without self-edges. The ratio is "
+        "that of edges within the data's radius on predicted over true positions, of their means "
+        f"over all steps, and at step {mark} the mean of ratios: above 1, the predicted particles "
+        "clump. Milliseconds of a step are medians of all models and policies in turns, on true "
+        f"positions of one trajectory of {data.times['particles']:,} particles, "
+        f"{data.times['threads']} threads.",
     )
 
 
 def _comparisons(results: Results, data: DataSet) -> Table:
-    mark = results.study.last_mark
+    marks = results.study.profile.marks
     rows = []
     for question, first, second in COMPARISONS:
         one, other = (results.find(data.name, *which) for which in (first, second))
         if one is None or other is None:
             continue
-        error = results.difference(one, other, f"mse@{mark}")
-        edges = results.difference(one, other, "edges_per_step")
         rows.append(
             Row(
                 [
                     question,
                     f"{first[0]}, {first[1]}",
                     f"{second[0]}, {second[1]}",
-                    _interval(error, "+.2e"),
-                    _relative(error, other.scalar(f"mse@{mark}").mean()),
-                    _interval(edges, "+,.0f"),
-                    _verdict(error, edges),
+                    *(_change(results, one, other, f"mse@{mark}") for mark in marks),
+                    _change(results, one, other, "kinetic_energy_error"),
+                    _interval(results.difference(one, other, "edges_per_step"), "+,.0f"),
+                    ", ".join(
+                        f"{value:+.0%}"
+                        for value in (
+                            one.scalar(f"mse@{marks[-1]}").mean(1)
+                            / other.scalar(f"mse@{marks[-1]}").mean(1)
+                            - 1
+                        )
+                    ),
                 ],
                 [*one.files, *other.files],
             )
         )
     return Table(
         f"comparisons-{data.name}",
-        f"Which is better on {data.name}",
+        f"One less the other on {data.name}",
         (
             "question",
             "one",
             "other",
-            f"MSE@{mark}: one - other",
-            "of the other's",
+            *(f"MSE@{mark}" for mark in marks),
+            "kinetic energy error",
             "edges a step",
-            "shown",
+            f"MSE@{marks[-1]}, seed by seed",
         ),
         rows,
-        "Differences are paired by seed and trajectory; in brackets their 95 % interval. "
-        "Something is shown where the interval excludes zero.",
+        "In percent of the other's mean. Differences are paired by seed and trajectory; in "
+        "brackets their 95 % interval, not corrected for the number of comparisons.",
     )
+
+
+def _change(results: Results, one: Series, other: Series, scalar: str) -> str:
+    """The difference of two means in percent of the second, with its interval."""
+    reference = other.scalar(scalar).mean()
+    difference = results.difference(one, other, scalar)
+    if not (np.isfinite(difference.mean) and reference):
+        return MISSING
+    mean, low, high = (value / reference for value in vars(difference).values())
+    return f"{mean:+.0%} [{low:+.0%}, {high:+.0%}]"
 
 
 def _clouds(results: Results, data: DataSet) -> Table:
@@ -255,7 +286,7 @@ def _clouds(results: Results, data: DataSet) -> Table:
                 series.model.title,
                 series.policy if series.model.edges else MISSING,
                 _interval(series.estimate("kinetic_energy_error"), ".3f"),
-                *(_interval(series.estimate(f"transport@{mark}"), ".1e") for mark in marks),
+                *(_interval(matched(series, mark), ".1e") for mark in marks),
             ],
             series.files,
         )
@@ -266,10 +297,17 @@ def _clouds(results: Results, data: DataSet) -> Table:
         f"Energy and where the matter is, {data.name}",
         ("model", "graph", "kinetic energy error", *(f"transport@{mark}" for mark in marks)),
         rows,
-        "Kinetic energy: root of the mean squared error over the steps, relative to that of the "
-        "truth. Transport: squared earth mover's distance between predicted and true particles "
-        "(length²), which Sinkhorn's algorithm approximates, here exact.",
+        "Kinetic energy: sum over the steps of the difference between predicted and true, over the "
+        "sum of the true one. Transport: squared earth mover's distance between predicted and true "
+        "particles (length²), which Sinkhorn's algorithm approximates, here exact; of trajectories "
+        f"up to {MATCHED:,} particles.",
     )
+
+
+def matched(series: Series, mark: int) -> Estimate:
+    """Of the transport at ``mark``, over the trajectories that were matched."""
+    values = series.scalar(f"transport@{mark}")
+    return estimate(values[:, np.isfinite(values).all(axis=0)])
 
 
 def _sweep(results: Results, data: DataSet) -> Table:
@@ -281,9 +319,9 @@ def _sweep(results: Results, data: DataSet) -> Table:
         Row(
             [
                 *(f"{row[name]:g}" for name in ("tau", "factor", "radius")),
-                f"{row['mse']:.2e}",
-                f"{row['edges']:,.0f}",
-                f"{row['clumping']:.2f}",
+                _number(row["mse"], ".2e"),
+                _number(row["edges"], ",.0f"),
+                _number(row["clumping"], ".2f"),
                 "yes" if row == chosen else "",
             ],
             [file],
@@ -327,7 +365,6 @@ def _along(results: Results, data: DataSet) -> Table:
         fixed, adaptive = (
             results.series[data.name, name, policy] for policy in ("fixed", "adaptive")
         )
-        error = results.difference(adaptive, fixed, f"mse@{mark}")
         edges = results.difference(adaptive, fixed, "edges_per_step")
         rows.append(
             Row(
@@ -335,8 +372,7 @@ def _along(results: Results, data: DataSet) -> Table:
                     f"{share:.0%} of {data.steps:,}",
                     _interval(fixed.estimate(f"mse@{mark}"), ".2e"),
                     _interval(fixed.estimate(f"clumping@{mark}"), ".2f"),
-                    _interval(error, "+.2e"),
-                    _relative(error, fixed.scalar(f"mse@{mark}").mean()),
+                    _change(results, adaptive, fixed, f"mse@{mark}"),
                     _interval(edges, "+,.0f"),
                 ],
                 [*fixed.files, *adaptive.files],
@@ -349,8 +385,7 @@ def _along(results: Results, data: DataSet) -> Table:
             "training steps",
             f"MSE@{mark}, fixed",
             f"ratio@{mark}, fixed",
-            "adaptive - fixed",
-            "of fixed",
+            "adaptive - fixed, of fixed",
             "edges a step",
         ),
         rows,
@@ -423,19 +458,8 @@ def _interval(value: Estimate, form: str) -> str:
     return f"{value.mean:{form}} [{value.low:{form}}, {value.high:{form}}]"
 
 
-def _relative(difference: Estimate, reference: float) -> str:
-    if not (np.isfinite(difference.mean) and reference):
-        return MISSING
-    return f"{difference.mean / reference:+.0%}"
-
-
-def _verdict(error: Estimate, edges: Estimate) -> str:
-    said = [
-        f"{'lower' if value.mean < 0 else 'higher'} {what}"
-        for what, value in (("error", error), ("edges", edges))
-        if value.shown
-    ]
-    return ", ".join(said) or "nothing"
+def _number(value: float | None, form: str) -> str:
+    return MISSING if value is None or not np.isfinite(value) else f"{value:{form}}"
 
 
 def series_label(series: Series) -> str:
