@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from adaptgns.checkpoint import LAST, read_checkpoint, write_checkpoint
+from adaptgns.fit import Diverged
 from adaptgns.reproduce import ReproduceConfig, main, reproduce, study_of
 from adaptgns.reproduce.report import MARKERS, write_into
-from adaptgns.reproduce.results import Results, estimate
+from adaptgns.reproduce.results import Estimate, Results, estimate
+from adaptgns.reproduce.runs import Run
 
 QUIET = Console(quiet=True)
 FIGURES = ("statistics", "graphs", "sigma", "steps", "pareto", "reliability", "clouds")
@@ -78,6 +81,8 @@ def test_every_number_comes_from_the_files_that_its_row_names(made: ReproduceCon
             assert row["files"] or row["cells"][0].endswith("paper's set"), (name, row)
         if not name.startswith("rollouts"):
             continue
+        centre = table["rows"].pop()
+        assert centre["files"] == [f"metrics/{name.split('-')[1]}/data.json"]
         for row in table["rows"]:
             rows = [
                 json.loads((folder(made) / file).read_text())["rollouts"][0]
@@ -158,6 +163,83 @@ def test_a_run_of_another_configuration_is_refused(
         reproduce(study, QUIET)
 
 
+def spoil(path: Path, **changes: object) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("nll-0-fixed.json", {"data_fingerprint": "another"}, "was measured on other data"),
+        ("nll-0-fixed.json", {"marks": [5, 20]}, r"was measured at other steps, \[5, 20\]"),
+        ("sweep/sweep.json", {"settings": {"edges": 1.0, "tau": [80.0]}}, "was made with tau"),
+    ],
+)
+def test_what_is_not_of_this_study_is_refused(
+    study: ReproduceConfig, name: str, changes: dict, message: str
+) -> None:
+    spoil(folder(study) / "metrics" / "sand" / name, **changes)
+    with pytest.raises(ValueError, match=message):
+        reproduce(study, QUIET)
+
+
+def test_other_data_of_one_name_are_refused(made: ReproduceConfig, tmp_path: Path) -> None:
+    other = tmp_path / "waterdrop"
+    shutil.copytree(folder(made) / "data" / "sand", other)
+    with pytest.raises(ValueError, match="describes other data than those in"):
+        reproduce(replace(made, data=(str(other), "sand")), QUIET)
+
+
+def test_nothing_builds_on_half_a_training(made: ReproduceConfig, tmp_path: Path) -> None:
+    out = tmp_path / "study"
+    shutil.copytree(folder(made), out)
+    for path in (out / "metrics" / "sand").glob("tuned-*"):
+        path.unlink()
+    last = out / "training" / "sand" / "nll-1" / LAST
+    checkpoint = read_checkpoint(last)
+    for half in (replace(checkpoint, step=4), replace(checkpoint, validated=False)):
+        write_checkpoint(last, half)
+        with pytest.raises(ValueError, match=r"sand/tuned-1: needs sand/nll-1, which is at step"):
+            reproduce(replace(made, out=out, only="sand/tuned-1"), QUIET)
+
+
+def test_a_run_that_fails_keeps_none_of_the_others(
+    made: ReproduceConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "study"
+    shutil.copytree(folder(made) / "data", out / "data")
+    train = Run.train
+
+    def failing(run: Run, console: Console) -> None:
+        if run.name == "waterdrop/mlp-0":
+            raise Diverged("the loss became nan")
+        train(run, console)
+
+    monkeypatch.setattr(Run, "train", failing)
+    with pytest.raises(RuntimeError, match="1 runs failed: waterdrop/mlp-0"):
+        reproduce(replace(made, out=out, only="*/mlp-*"), QUIET)
+    done = sorted(path.stem for path in (out / "metrics" / "waterdrop").glob("mlp-*"))
+    assert done == ["mlp-1-fixed"]
+
+
+def test_a_diverged_rollout_is_reported(study: ReproduceConfig) -> None:
+    """Its figures are null in the metrics, and a dash in the tables."""
+    path = folder(study) / "metrics" / "sand" / "nll-1-two-pass.json"
+    content = json.loads(path.read_text())
+    scalars = content["rollouts"][0]["scalars"]
+    for name in ("mse@10", "clumping@10", "kinetic_energy_error", "transport@10"):
+        scalars[name] = {"mean": None, "per_trajectory": [None, 1.0]}
+    path.write_text(json.dumps(content))
+    reproduce(study, QUIET)
+    row = next(
+        row["cells"]
+        for row in tables(study)["rollouts-sand"]["rows"]
+        if row["cells"][:2] == ["GNS, NLL", "two-pass"]
+    )
+    assert row[3] == "–"
+    assert "nan" not in (folder(study) / "report.md").read_text()
+
+
 def test_a_training_of_another_configuration_is_refused(made: ReproduceConfig) -> None:
     study = study_of(made)
     run = next(iter(study.runs()))
@@ -228,18 +310,33 @@ def test_wrong_input_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
         assert message in capsys.readouterr().err.replace("\n", " ")
 
 
-def test_intervals_hold_seeds_and_trajectories() -> None:
+@pytest.mark.parametrize(
+    ("seeds", "trajectories", "rest"),
+    [(1.0, 0.0, 0.3), (1.0, 1.0, 1.0), (0.0, 1.0, 0.5), (0.0, 0.0, 1.0), (1.0, 1.0, 0.1)],
+)
+def test_intervals_cover(seeds: float, trajectories: float, rest: float) -> None:
+    """Of 1,000 studies of three seeds and ten trajectories, about 950 hold the truth, whatever
+    varies: seeds, trajectories or neither."""
     rng = np.random.default_rng(0)
-    seeds, trajectories = rng.normal(0, 1, (3, 1)), rng.normal(0, 2, (1, 10))
-    found = estimate(5 + seeds + trajectories)
-    assert found.mean == pytest.approx(5 + seeds.mean() + trajectories.mean())
-    assert found.low < found.mean < found.high
-    assert found.shown
-    # All of a seed's trajectories move together: more of them do not narrow the interval to zero.
-    spread = estimate(np.repeat(seeds, 1000, axis=1))
-    assert spread.high - spread.low > 0.5 * np.ptp(seeds)
-    assert not estimate(np.array([[-1.0, 1.0], [1.0, -1.0]])).shown
-    assert np.isnan(estimate(np.array([[np.nan, 1.0]])).mean)
+    held = 0
+    for _ in range(1_000):
+        values = seeds * rng.normal(size=(3, 1)) + trajectories * rng.normal(size=(1, 10))
+        found = estimate(5 + values + rest * rng.normal(size=(3, 10)))
+        held += found.low <= 5 <= found.high
+    assert 900 <= held <= 990
+
+
+def test_intervals_of_little() -> None:
+    assert estimate(np.full((3, 4), 2.0)) == Estimate(2.0, 2.0, 2.0)
+    one = estimate(np.array([[1.0]]))
+    assert (one.mean, one.low, one.high) == (1.0, -np.inf, np.inf)
+    for values in (np.array([[np.nan, 1.0]]), np.empty((3, 0))):
+        assert np.isnan(estimate(values).mean)
+    # Trajectories alone: Student's t of their mean.
+    alone = estimate(np.array([[1.0, 2.0, 4.0]]))
+    assert alone.high - alone.mean == pytest.approx(
+        4.3027 * np.std([1, 2, 4], ddof=1) / 3**0.5, 1e-4
+    )
 
 
 def test_differences_are_paired(made: ReproduceConfig) -> None:

@@ -187,6 +187,25 @@ def test_kinematic_particles_follow_their_trajectory(
     assert not np.array_equal(predicted[:, 1::3], trajectory.positions[6:11, 1::3])
 
 
+def test_positions_that_are_lost_stay_lost(
+    simulator: Simulator, trajectory: Trajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    advance, calls = simulator.advance, 0
+
+    def losing(*arguments: torch.Tensor) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        positions = advance(*arguments)
+        return positions * torch.nan if calls == 3 else positions
+
+    monkeypatch.setattr(simulator, "advance", losing)
+    made = list(steps(simulator, trajectory, Adaptive(RULE), 6))
+    assert [bool(np.isfinite(step.positions).all()) for step in made] == [True] * 2 + [False] * 4
+    assert [step.edges for step in made[3:]] == [0, 0, 0]
+    assert made[-1].sigma is not None
+    assert calls == 3
+
+
 def test_radius_changes_the_graph_alone(simulator: Simulator, trajectory: Trajectory) -> None:
     (narrow,) = steps(simulator, trajectory, Fixed(), 1)
     (wide,) = steps(simulator, trajectory, Fixed(), 1, radius=0.03)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from adaptgns.sweep import RESULT, SweepConfig, main, sweep
+from adaptgns.sweep import RESULT, SweepConfig, main, measure, sweep
 from adaptgns.train import main as train
 
 QUIET = Console(quiet=True)
@@ -64,6 +64,42 @@ def test_what_was_tried_is_not_tried_again(
     assert sweep(config, QUIET)["trials"] == second["trials"]
     with pytest.raises(ValueError, match="holds trials with other steps"):
         sweep(replace(config, steps=4), QUIET)
+
+
+def test_an_interrupted_trial_is_made_again(
+    config: SweepConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = 0
+
+    def interrupted(*arguments: object, **rule: float) -> dict[str, float]:
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise KeyboardInterrupt
+        return measure(*arguments, **rule)
+
+    monkeypatch.setattr("adaptgns.sweep.measure", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        sweep(config, QUIET)
+    found = [(row["tau"], row["radius"]) for row in sweep(config, QUIET)["trials"]]
+    assert sorted(found) == [(t, r) for t in (60, 90) for r in (0.012, 0.015)]
+
+
+def test_what_diverged_is_never_chosen(
+    config: SweepConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = iter((0.3, float("nan"), 0.1, float("inf")))
+
+    def made_up(*_: object, **__: float) -> dict[str, float]:
+        return {"mse": next(errors), "edges": 10.0, "clumping": 1.0, "milliseconds": 1.0}
+
+    monkeypatch.setattr("adaptgns.sweep.measure", made_up)
+    result = sweep(config, QUIET)
+    assert result["chosen"]["mse"] == 0.1
+    assert [row["mse"] for row in result["trials"][:2]] == [0.1, 0.3]
+    errors = iter([float("nan")] * 4)
+    with pytest.raises(ValueError, match="every trial diverged"):
+        sweep(replace(config, out=config.out.with_name("other")), QUIET)
 
 
 def test_the_budget_of_edges_holds(config: SweepConfig) -> None:

@@ -239,7 +239,7 @@ def _comparisons(results: Results, data: DataSet) -> Table:
                     _change(results, one, other, "kinetic_energy_error"),
                     _interval(results.difference(one, other, "edges_per_step"), "+,.0f"),
                     ", ".join(
-                        f"{value:+.0%}"
+                        _number(value, "+.0%")
                         for value in (
                             one.scalar(f"mse@{marks[-1]}").mean(1)
                             / other.scalar(f"mse@{marks[-1]}").mean(1)
