@@ -87,6 +87,13 @@ EARLY = tuple(
     )
     for percent in (10, 30)
 )
+ADAPTIVE_NLL = replace(
+    NLL,
+    name="nll-adaptive",
+    title="AdaptGNS, trained on adaptive graphs",
+    graph="adaptive",
+    policies=("fixed", "adaptive", "random"),
+)
 DECOUPLED = Model(
     "decoupled",
     "GNS, decoupled",
@@ -130,13 +137,7 @@ PAPER_MODELS = (
     *EARLY,
     replace(MSE, name="mse-denser", title="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)),
     replace(NLL, name="nll-middle", title="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)),
-    replace(
-        NLL,
-        name="nll-adaptive",
-        title="AdaptGNS, trained on adaptive graphs",
-        graph="adaptive",
-        policies=("fixed", "adaptive", "random"),
-    ),
+    ADAPTIVE_NLL,
     replace(NLL, name="beta-nll", title="GNS, beta-NLL", loss="beta-nll"),
     replace(
         MSE, name="mse-matched", title="GNS, MSE, matched r", radius="matched", policies=("fixed",)
@@ -205,7 +206,7 @@ PROFILES: dict[ProfileName, Profile] = {
     ),
     "laptop": Profile(
         base=PRESETS["laptop"],
-        models=(MSE, NLL, MLP, TUNED),
+        models=(MSE, NLL, MLP, *EARLY, ADAPTIVE_NLL, DECOUPLED, TUNED),
         sweep=Sweep(trajectories=5),
         seeds=(0, 1, 2),
         marks=(50, 100, 200),

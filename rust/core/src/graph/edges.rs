@@ -3,8 +3,8 @@
 use std::mem::MaybeUninit;
 
 use super::Graph;
-use super::lanes::{BLOCK, Lanes, Work, widest};
-use super::memory::{Budget, reserve};
+use super::lanes::{LONGEST, Lanes, Work, widest};
+use super::memory::{Budget, filled, reserve};
 use super::order::{NONE, write_sorted};
 use crate::Error;
 use crate::threads::{self, Threads};
@@ -20,7 +20,7 @@ pub(super) struct Rows {
 }
 
 /// Room that there always is behind a row.
-const ROOM: usize = BLOCK;
+const ROOM: usize = LONGEST;
 
 impl Rows {
     pub fn with_receivers(receivers: usize) -> Self {
@@ -67,6 +67,12 @@ fn no_memory_for(edges: usize) -> Error {
     ))
 }
 
+/// Rows that lie between the one that is written and the one that is fetched from memory
+/// meanwhile: where receivers are not in the order of their cells, each is somewhere else.
+const SOON: usize = 32;
+/// Numbers of a row to a line of the cache.
+const LINE: usize = 16;
+
 /// Receivers whose rows are written as one task.
 const TASK: usize = 4096;
 
@@ -79,24 +85,23 @@ pub(super) fn assemble(
     threads: Threads,
     budget: &Budget,
 ) -> Result<Graph, Error> {
-    let mut counts = vec![0_u32; particles];
-    let mut rows: Vec<&[i32]> = vec![&[]; particles];
+    // First how many edges each receiver has, behind its place, then their sums.
+    let mut offsets = filled(0_i64, particles + 1);
+    let mut rows: Vec<&[i32]> = filled(&[][..], particles);
     for (receivers, part) in parts {
         let mut senders = &part.senders[..];
         for (&receiver, &count) in receivers.iter().zip(&part.counts) {
             // A row has room behind it, which lets whole blocks be read.
-            counts[receiver as usize] = count - u32::from(drop_self);
+            offsets[receiver as usize + 1] = i64::from(count) - i64::from(drop_self);
             rows[receiver as usize] = senders;
             senders = &senders[count as usize..];
         }
     }
-    let mut offsets = Vec::with_capacity(particles + 1);
     let mut total = 0;
-    offsets.push(0);
-    offsets.extend(counts.iter().map(|&count| {
-        total += i64::from(count);
-        total
-    }));
+    for offset in &mut offsets {
+        total += *offset;
+        *offset = total;
+    }
 
     let edges = total as usize;
     budget.check(edges)?;
@@ -140,13 +145,17 @@ impl Work for Writing<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<L: Lanes>(self, lanes: L) {
-        let counts = self
-            .offsets
-            .windows(2)
-            .map(|pair| (pair[1] - pair[0]) as usize);
+    fn run<const BLOCK: usize, L: Lanes<BLOCK>>(self, lanes: L) {
+        let count = |k: usize| (self.offsets[k + 1] - self.offsets[k]) as usize;
         let mut at = 0;
-        for ((receiver, row), count) in (self.first..).zip(self.rows).zip(counts) {
+        for (k, row) in self.rows.iter().enumerate() {
+            if let Some(soon) = self.rows.get(k + SOON) {
+                for place in (0..count(k + SOON) + LINE).step_by(LINE) {
+                    lanes.prefetch(soon.as_ptr().wrapping_add(place));
+                }
+            }
+            let receiver = self.first + k as i32;
+            let count = count(k);
             let dropped = if self.drop_self { receiver } else { NONE };
             let found = count + usize::from(self.drop_self);
             // SAFETY: a search finds every sender once, the receiver among them.
@@ -161,10 +170,11 @@ impl Work for Writing<'_> {
 /// room, since what they write too much the next row overwrites.
 #[inline(always)]
 fn fill(out: &mut [MaybeUninit<i64>], count: usize, value: i64) {
-    for start in (0..count).step_by(BLOCK) {
+    const WHOLE: usize = 8;
+    for start in (0..count).step_by(WHOLE) {
         let out = &mut out[start..];
-        match out.first_chunk_mut::<BLOCK>() {
-            Some(out) => *out = [MaybeUninit::new(value); BLOCK],
+        match out.first_chunk_mut::<WHOLE>() {
+            Some(out) => *out = [MaybeUninit::new(value); WHOLE],
             None => out[..count - start].fill(MaybeUninit::new(value)),
         }
     }

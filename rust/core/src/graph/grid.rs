@@ -8,7 +8,7 @@
 
 use std::ops::Range;
 
-use super::lanes::BLOCK;
+use super::lanes::LONGEST;
 use super::scalar::Scalar;
 
 /// Above this many cells per particle (plus a constant) a grid stores occupied rows only.
@@ -187,12 +187,12 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
                 order
                     .clone()
                     .map(|i| positions[i as usize][a])
-                    .chain([T::default(); BLOCK])
+                    .chain([T::default(); LONGEST])
                     .collect()
             }),
             index: order
                 .map(|i| first as i32 + i as i32)
-                .chain([0; BLOCK])
+                .chain([0; LONGEST])
                 .collect(),
         }
     }
@@ -226,7 +226,7 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
 
     /// The caller's indices of the sorted particles.
     pub fn index(&self) -> &[i32] {
-        &self.index[..self.index.len() - BLOCK]
+        &self.index[..self.index.len() - LONGEST]
     }
 
     /// A lower bound of the number of ordered pairs, no particle with itself, that are

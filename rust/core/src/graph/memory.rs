@@ -56,6 +56,13 @@ fn available_memory() -> usize {
     usize::try_from(bytes).unwrap_or(usize::MAX)
 }
 
+/// `count` times `value`, in memory as [`reserve`] asks for it.
+pub(super) fn filled<T: Copy>(value: T, count: usize) -> Vec<T> {
+    let mut all = reserve(count).unwrap_or_default();
+    all.resize(count, value);
+    all
+}
+
 /// An empty vector with room for `count` values, `None` if there is no memory for it.
 ///
 /// Fresh memory is mapped page by page as it is written to, which for a large graph takes as

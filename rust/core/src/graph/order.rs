@@ -2,44 +2,32 @@
 
 use std::mem::MaybeUninit;
 
-use super::lanes::{BLOCK, Lanes};
+use super::lanes::{LONGEST, Lanes};
 
-/// Longest row that is sorted by ranks.
-const RANKED: usize = 64;
+/// Longest row that is sorted in vector instructions.
+pub(super) const SHORT: usize = 64;
 
 /// Stands for no sender: larger than any.
 pub(super) const NONE: i32 = i32::MAX;
 
-/// Writes the first `n` of `row`, which are distinct, in ascending order to the front of
-/// `out`, without `dropped`, which is one of them or [`NONE`]. `row` goes on for a block
-/// behind its contents, and in `out` one place behind them may be overwritten.
-///
-/// In a short row each sender's place is the number of smaller ones. That is quadratic,
-/// but several comparisons go to an instruction, and no branch depends on their outcome.
+/// Writes the first `n` of `row` in ascending order to the front of `out`, without `dropped`,
+/// which is one of them or [`NONE`]. In `out` what lies behind them may be overwritten.
 ///
 /// # Safety
-/// The senders are distinct, and `dropped` is one of them or [`NONE`].
+/// The senders are distinct, and `row` goes on for a block behind them.
 #[inline(always)]
-pub(super) unsafe fn write_sorted<L: Lanes>(
+pub(super) unsafe fn write_sorted<const BLOCK: usize, L: Lanes<BLOCK>>(
     lanes: L,
     row: &[i32],
     n: usize,
     dropped: i32,
     out: &mut [MaybeUninit<i64>],
 ) {
-    let kept = n - usize::from(dropped != NONE);
-    if n > RANKED || out.len() <= kept {
+    if n > SHORT || out.len() < n.next_multiple_of(LONGEST) {
         return write_sorted_long(&row[..n], dropped, out);
     }
-    for start in (0..n).step_by(BLOCK) {
-        let keys = row[start..].first_chunk().expect("room");
-        let places = lanes.places(keys, n - start, &row[..n], dropped, kept as i32);
-        for (&key, &place) in keys.iter().zip(&places) {
-            debug_assert!((0..=kept).contains(&(place as usize)));
-            // SAFETY: of distinct senders at most `kept` are smaller, and there are more places.
-            unsafe { out.get_unchecked_mut(place as usize) }.write(i64::from(key));
-        }
-    }
+    // SAFETY: promised by the caller, and there is room.
+    unsafe { lanes.write_sorted(row, n, dropped, out.as_mut_ptr().cast()) }
 }
 
 #[cold]
@@ -49,5 +37,37 @@ fn write_sorted_long(row: &[i32], dropped: i32, out: &mut [MaybeUninit<i64>]) {
     let kept = row.iter().filter(|&&sender| sender != dropped);
     for (slot, &sender) in out.iter_mut().zip(kept) {
         slot.write(i64::from(sender));
+    }
+}
+
+/// [`Lanes::write_sorted`] where each sender's place is the number of smaller ones, which `ranks`
+/// tells for each of its first argument among its second. That is quadratic, but several
+/// comparisons go to an instruction, and no branch depends on their outcome.
+///
+/// # Safety
+/// As there.
+#[inline(always)]
+pub(super) unsafe fn write_ranked<const BLOCK: usize>(
+    row: &[i32],
+    n: usize,
+    dropped: i32,
+    out: *mut i64,
+    ranks: impl Fn(&[i32; BLOCK], &[i32]) -> [i32; BLOCK],
+) {
+    let kept = n - usize::from(dropped != NONE);
+    for start in (0..n).step_by(BLOCK) {
+        let keys = row[start..].first_chunk().expect("room");
+        let ranks = ranks(keys, &row[..n]);
+        for l in 0..BLOCK {
+            let place = if start + l < n && keys[l] != dropped {
+                ranks[l] as usize - usize::from(keys[l] > dropped)
+            } else {
+                kept
+            };
+            debug_assert!(place <= kept);
+            // SAFETY: of distinct senders fewer than n are smaller, and a dropped one goes behind
+            // the others, where there is room.
+            unsafe { out.add(place).write(i64::from(keys[l])) };
+        }
     }
 }

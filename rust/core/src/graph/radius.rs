@@ -74,17 +74,20 @@ pub(super) fn within_cutoff<T: Scalar>(
 }
 
 /// Sorted particles searched as one task.
-const TASK: usize = 1024;
+const TASK: usize = 512;
 
-/// Particles below which starting other threads costs more than it saves.
-const SERIAL: usize = 2048;
+/// Particles below which starting other threads costs more than it saves: fewer in three
+/// dimensions, where each takes longer.
+const fn serial(dim: usize) -> usize {
+    if dim == 2 { 2048 } else { 768 }
+}
 
 fn build<T: Scalar, const D: usize>(
     batch: &Batch<'_, T, D>,
     cutoff: Cutoff<'_, T>,
     options: &Options,
 ) -> Result<Graph, Error> {
-    let threads = options.threads.unless(batch.positions.len() < SERIAL);
+    let threads = options.threads.unless(batch.positions.len() < serial(D));
     let budget = Budget::default();
     let searches = threads::map(threads, batch.graphs.clone(), |graph| {
         Search::new(batch, graph, cutoff, &budget)
@@ -124,7 +127,7 @@ mod tests {
     use std::num::NonZeroUsize;
 
     use super::*;
-    use crate::graph::lanes::PLAIN;
+    use crate::graph::lanes::{Kind, MOST};
 
     #[test]
     fn every_processor_builds_the_same_graph() {
@@ -162,14 +165,20 @@ mod tests {
                     self_edges,
                     threads: threads::Threads::AtMost(NonZeroUsize::MIN),
                 };
-                let build = |plain| {
-                    PLAIN.set(plain);
+                let build = |kind| {
+                    MOST.set(kind);
                     [Radius::Uniform(r), Radius::PerParticle(&radii)]
                         .map(|radius| radius_graph(&particles, radius, &options).expect("room"))
                 };
-                let graphs = build(true);
+                let graphs = build(Kind::Portable);
                 assert!(graphs.iter().all(|graph| graph.senders().len() > 4 * COUNT));
-                assert_eq!(graphs, build(false), "{dim} {period:?} {self_edges}");
+                for kind in [Kind::Avx2, Kind::Avx512] {
+                    assert_eq!(
+                        graphs,
+                        build(kind),
+                        "{kind:?} {dim} {period:?} {self_edges}"
+                    );
+                }
             }
         }
     }

@@ -2,7 +2,8 @@
 
 use std::ops::{Add, Mul, Sub};
 
-use super::lanes::BLOCK;
+#[cfg(target_arch = "x86_64")]
+use super::lanes::{LONGEST, SHORTER};
 
 mod sealed {
     pub trait Sealed {}
@@ -58,11 +59,18 @@ pub trait Scalar:
     /// The processor has AVX2.
     #[cfg(target_arch = "x86_64")]
     #[doc(hidden)]
-    unsafe fn at_most_avx2(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8;
+    unsafe fn at_most_avx2(values: &[Self; SHORTER], limits: &[Self; SHORTER]) -> u16;
+    /// The same.
+    ///
+    /// # Safety
+    /// The processor has AVX-512.
+    #[cfg(target_arch = "x86_64")]
+    #[doc(hidden)]
+    unsafe fn at_most_avx512(values: &[Self; LONGEST], limits: &[Self; LONGEST]) -> u16;
 }
 
 macro_rules! scalar {
-    ($kind:ident, $name:literal, $per:literal, $load:ident, $compare:ident, $mask:ident) => {
+    ($kind:ident, $name:literal, avx2($per:literal, $load:ident, $compare:ident, $mask:ident), avx512($per512:literal, $load512:ident, $compare512:ident)) => {
         impl Scalar for $kind {
             const INFINITY: Self = $kind::INFINITY;
             const NAN: Self = $kind::NAN;
@@ -103,7 +111,7 @@ macro_rules! scalar {
             }
             #[cfg(target_arch = "x86_64")]
             #[inline(always)]
-            unsafe fn at_most_avx2(values: &[Self; BLOCK], limits: &[Self; BLOCK]) -> u8 {
+            unsafe fn at_most_avx2(values: &[Self; SHORTER], limits: &[Self; SHORTER]) -> u16 {
                 use std::arch::x86_64::{_CMP_LE_OQ, $compare, $load, $mask};
                 let (values, limits) = (values.as_chunks::<$per>(), limits.as_chunks::<$per>());
                 let chunks = values.0.iter().zip(limits.0).rev();
@@ -114,7 +122,24 @@ macro_rules! scalar {
                         $mask($compare::<_CMP_LE_OQ>(values, limits))
                     };
                     bits << $per | near as u32
-                }) as u8
+                }) as u16
+            }
+            #[cfg(target_arch = "x86_64")]
+            #[inline(always)]
+            unsafe fn at_most_avx512(values: &[Self; LONGEST], limits: &[Self; LONGEST]) -> u16 {
+                use std::arch::x86_64::{_CMP_LE_OQ, $compare512, $load512};
+                let (values, limits) =
+                    (values.as_chunks::<$per512>(), limits.as_chunks::<$per512>());
+                let chunks = values.0.iter().zip(limits.0).rev();
+                chunks.fold(0, |bits: u32, (values, limits)| {
+                    // SAFETY: promised by the caller, and the loads read the chunks.
+                    let near = unsafe {
+                        let (values, limits) =
+                            ($load512(values.as_ptr()), $load512(limits.as_ptr()));
+                        $compare512::<_CMP_LE_OQ>(values, limits)
+                    };
+                    bits << $per512 | u32::from(near)
+                }) as u16
             }
         }
     };
@@ -123,16 +148,12 @@ macro_rules! scalar {
 scalar!(
     f32,
     "float32",
-    8,
-    _mm256_loadu_ps,
-    _mm256_cmp_ps,
-    _mm256_movemask_ps
+    avx2(8, _mm256_loadu_ps, _mm256_cmp_ps, _mm256_movemask_ps),
+    avx512(16, _mm512_loadu_ps, _mm512_cmp_ps_mask)
 );
 scalar!(
     f64,
     "float64",
-    4,
-    _mm256_loadu_pd,
-    _mm256_cmp_pd,
-    _mm256_movemask_pd
+    avx2(4, _mm256_loadu_pd, _mm256_cmp_pd, _mm256_movemask_pd),
+    avx512(8, _mm512_loadu_pd, _mm512_cmp_pd_mask)
 );

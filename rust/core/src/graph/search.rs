@@ -9,7 +9,7 @@ use std::ops::Range;
 use super::edges::Rows;
 use super::grid::Grid;
 use super::input::Batch;
-use super::lanes::{BLOCK, Lanes, Work, widest};
+use super::lanes::{LONGEST, Lanes, Work, widest};
 use super::memory::Budget;
 use super::scalar::Scalar;
 use crate::Error;
@@ -64,7 +64,7 @@ impl<T: Scalar, const D: usize> Search<T, D> {
                     let r = radii[i as usize];
                     r * r
                 });
-                Limits::PerParticle(squares.chain([T::default(); BLOCK]).collect())
+                Limits::PerParticle(squares.chain([T::default(); LONGEST]).collect())
             }
         };
         Ok(Self {
@@ -116,14 +116,21 @@ impl<T: Scalar, const D: usize, const PERIODIC: bool, const UNIFORM: bool> Work
     type Output = Result<Rows, Error>;
 
     #[inline(always)]
-    fn run<L: Lanes>(self, lanes: L) -> Self::Output {
+    fn run<const BLOCK: usize, L: Lanes<BLOCK>>(self, lanes: L) -> Self::Output {
         let mut rows = Rows::with_receivers(self.slots.len());
-        let mut candidates = Candidates::new();
         let mut cells = self.search.grid.cells(self.slots);
-        while let Some(receivers) = cells.next() {
-            candidates.gather::<UNIFORM>(self.search, cells.runs());
+        // Those of the next cell are gathered before those of this one are looked at, since what
+        // was just written can't be read in other blocks for a while.
+        let (mut candidates, mut coming) = (Candidates::new(), Candidates::new());
+        let mut receivers = 0..0;
+        loop {
+            let next = cells.next();
+            if next.is_some() {
+                coming.gather::<BLOCK, UNIFORM>(self.search, cells.runs());
+            }
             for receiver in receivers {
-                let near = candidates.near::<_, PERIODIC, UNIFORM>(lanes, self.search, receiver);
+                let near =
+                    candidates.near::<BLOCK, _, PERIODIC, UNIFORM>(lanes, self.search, receiver);
                 let row = rows.next(candidates.count, self.budget)?.as_mut_ptr();
                 let mut n = 0;
                 for start in (0..candidates.count).step_by(BLOCK) {
@@ -136,6 +143,9 @@ impl<T: Scalar, const D: usize, const PERIODIC: bool, const UNIFORM: bool> Work
                 }
                 rows.finish(n);
             }
+            let Some(next) = next else { break };
+            receivers = next;
+            std::mem::swap(&mut candidates, &mut coming);
         }
         Ok(rows)
     }
@@ -165,7 +175,11 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
 
     /// Holds the sorted particles `runs` instead.
     #[inline(always)]
-    fn gather<const UNIFORM: bool>(&mut self, search: &Search<T, D>, runs: &[Range<usize>]) {
+    fn gather<const BLOCK: usize, const UNIFORM: bool>(
+        &mut self,
+        search: &Search<T, D>,
+        runs: &[Range<usize>],
+    ) {
         self.count = runs.iter().map(Range::len).sum();
         let room = self.count + BLOCK;
         if self.index.len() < room {
@@ -182,11 +196,11 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
                 // the candidates.
                 unsafe {
                     for (coords, sorted) in self.coords.iter_mut().zip(&search.grid.coords) {
-                        copy_block(sorted, from, coords, to);
+                        copy_block::<BLOCK, _>(sorted, from, coords, to);
                     }
-                    copy_block(&search.grid.index, from, &mut self.index, to);
+                    copy_block::<BLOCK, _>(&search.grid.index, from, &mut self.index, to);
                     if let (false, Limits::PerParticle(limits)) = (UNIFORM, &search.limits) {
-                        copy_block(limits, from, &mut self.limits, to);
+                        copy_block::<BLOCK, _>(limits, from, &mut self.limits, to);
                     }
                 }
             }
@@ -198,12 +212,12 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
     /// A function that tells which candidates are within the cutoff of the sorted particle
     /// `receiver`: one bit for each of the block from a candidate on.
     #[inline(always)]
-    fn near<L: Lanes, const PERIODIC: bool, const UNIFORM: bool>(
+    fn near<const BLOCK: usize, L: Lanes<BLOCK>, const PERIODIC: bool, const UNIFORM: bool>(
         &self,
         lanes: L,
         search: &Search<T, D>,
         receiver: usize,
-    ) -> impl Fn(usize) -> u8 {
+    ) -> impl Fn(usize) -> u16 {
         let here: [T; D] = std::array::from_fn(|a| search.grid.coords[a][receiver]);
         let period = search.period;
         let limit = match &search.limits {
@@ -214,7 +228,7 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
             let mut distances = [T::default(); BLOCK];
             for a in 0..D {
                 // SAFETY: `start` is a candidate.
-                let there = unsafe { block(&self.coords[a], start) };
+                let there: &[T; BLOCK] = unsafe { block(&self.coords[a], start) };
                 for l in 0..BLOCK {
                     let d = separation::<T, PERIODIC>(here[a], there[l], period[a]);
                     distances[l] = distances[l] + d * d;
@@ -224,7 +238,7 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
                 lanes.at_most(&distances, &[limit; BLOCK])
             } else {
                 // SAFETY: as above.
-                let theirs = unsafe { block(&self.limits, start) };
+                let theirs: &[T; BLOCK] = unsafe { block(&self.limits, start) };
                 lanes.at_most(&distances, &theirs.map(|theirs| theirs.greater(limit)))
             }
         }
@@ -250,7 +264,7 @@ pub(super) fn separation<T: Scalar, const PERIODIC: bool>(from: T, to: T, period
 /// # Safety
 /// There are that many.
 #[inline(always)]
-unsafe fn block<T>(values: &[T], start: usize) -> &[T; BLOCK] {
+unsafe fn block<const BLOCK: usize, T>(values: &[T], start: usize) -> &[T; BLOCK] {
     debug_assert!(start + BLOCK <= values.len());
     // SAFETY: promised by the caller.
     unsafe { &*values.as_ptr().add(start).cast() }
@@ -261,13 +275,18 @@ unsafe fn block<T>(values: &[T], start: usize) -> &[T; BLOCK] {
 /// # Safety
 /// There are such blocks.
 #[inline(always)]
-unsafe fn copy_block<T: Copy>(from: &[T], start: usize, to: &mut [T], end: usize) {
+unsafe fn copy_block<const BLOCK: usize, T: Copy>(
+    from: &[T],
+    start: usize,
+    to: &mut [T],
+    end: usize,
+) {
     debug_assert!(end + BLOCK <= to.len());
     // SAFETY: promised by the caller.
     unsafe {
         to.as_mut_ptr()
             .add(end)
             .cast::<[T; BLOCK]>()
-            .write_unaligned(*block(from, start))
+            .write_unaligned(*block::<BLOCK, _>(from, start))
     };
 }
