@@ -7,7 +7,13 @@ mod graph;
 mod mpm;
 mod network;
 
+use mimalloc::MiMalloc;
 use pyo3::prelude::*;
+
+/// Keeps what is freed for a while: from step to step of a rollout the same memory is asked for,
+/// and the usual allocator gives that back to the system each time, to get it again page by page.
+#[global_allocator]
+static ALLOCATOR: MiMalloc = MiMalloc;
 
 /// Graph builders, the data generator and the graph network of AdaptGNS.
 #[pymodule]

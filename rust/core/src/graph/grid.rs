@@ -11,6 +11,13 @@ use std::ops::Range;
 use super::lanes::LONGEST;
 use super::scalar::Scalar;
 
+/// Particles that are worth the care for a group of cells: that takes longer than the search
+/// among a few candidates more.
+const WORTH: f64 = 5.0;
+
+/// Most cells in a group.
+const MOST_TOGETHER: f64 = 4.0;
+
 /// Above this many cells per particle (plus a constant) a grid stores occupied rows only.
 const MOST_CELLS_PER_PARTICLE: usize = 16;
 
@@ -20,6 +27,8 @@ const MOST_RUNS: usize = 2 * 9;
 pub(super) struct Grid<T, const D: usize> {
     axes: [Axis; D],
     rows: Rows<D>,
+    /// Cells along x that are walked through together.
+    together: u64,
     /// Coordinates in cell order, one array per axis, inside the box on periodic axes.
     pub coords: [Vec<T>; D],
     /// The caller's index of each sorted particle.
@@ -95,21 +104,22 @@ impl Axis {
         cell.min(self.count - 1)
     }
 
-    /// The cell and those beside it, each once, as one run and on a periodic axis perhaps
+    /// The cells and those beside them, each once, as one run and on a periodic axis perhaps
     /// a second one.
     #[inline(always)]
-    fn around(&self, cell: u64) -> [Range<u64>; 2] {
+    fn around(&self, cells: Range<u64>) -> [Range<u64>; 2] {
         let n = self.count;
+        let (before, behind) = (cells.start.saturating_sub(1), cells.end + 1);
         if !self.periodic {
-            [cell.saturating_sub(1)..n.min(cell + 2), 0..0]
-        } else if n <= 3 {
+            [before..n.min(behind), 0..0]
+        } else if cells.end - cells.start + 2 >= n {
             [0..n, 0..0]
-        } else if cell == 0 {
-            [0..2, n - 1..n]
-        } else if cell == n - 1 {
-            [cell - 1..n, 0..1]
+        } else if cells.start == 0 {
+            [0..behind, n - 1..n]
+        } else if cells.end == n {
+            [before..n, 0..1]
         } else {
-            [cell - 1..cell + 2, 0..0]
+            [before..behind, 0..0]
         }
     }
 }
@@ -180,9 +190,12 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
         axes: [Axis; D],
         rows: Rows<D>,
     ) -> Self {
+        let cells = axes.iter().map(|axis| axis.count as f64).product::<f64>();
+        let together = (WORTH * cells / positions.len() as f64).ceil();
         Self {
             axes,
             rows,
+            together: together.clamp(1.0, MOST_TOGETHER) as u64,
             coords: std::array::from_fn(|a| {
                 order
                     .clone()
@@ -255,7 +268,7 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
         ((pairs / boxes) as usize).saturating_sub(self.index().len())
     }
 
-    /// Goes through the occupied cells of the sorted particles `slots`.
+    /// Goes through the sorted particles `slots`, group of cells after group.
     pub fn cells(&self, slots: Range<usize>) -> Cells<'_, T, D> {
         Cells {
             grid: self,
@@ -285,12 +298,12 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
             }
         };
         let z_runs = if D == 3 {
-            self.axes[2].around(z)
+            self.axes[2].around(z..z + 1)
         } else {
             [0..1, 0..0]
         };
         for z in z_runs.into_iter().flatten() {
-            for y in y_axis.around(y).into_iter().flatten() {
+            for y in y_axis.around(y..y + 1).into_iter().flatten() {
                 match &self.rows {
                     Rows::Dense { .. } => neighbours.push((z * y_axis.count + y) as usize),
                     Rows::Sparse { keys, .. } => {
@@ -307,7 +320,7 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
     }
 }
 
-/// A walk through the occupied cells of some sorted particles.
+/// A walk through the cells of some sorted particles.
 pub(super) struct Cells<'a, T, const D: usize> {
     grid: &'a Grid<T, D>,
     /// The particles still to come.
@@ -323,13 +336,13 @@ pub(super) struct Cells<'a, T, const D: usize> {
 
 impl<T: Scalar, const D: usize> Cells<'_, T, D> {
     /// The runs of sorted particles that hold every particle within the cutoff of any in
-    /// the cell, each once.
+    /// the group, each once.
     #[inline(always)]
     pub fn runs(&self) -> &[Range<usize>] {
         &self.runs[..self.run_count]
     }
 
-    /// The particles of the next cell, whose surroundings are then in [`Self::runs`].
+    /// The particles of the next group of cells, whose surroundings are then in [`Self::runs`].
     #[inline(always)]
     pub fn next(&mut self) -> Option<Range<usize>> {
         let Grid { axes, rows, .. } = self.grid;
@@ -345,7 +358,8 @@ impl<T: Scalar, const D: usize> Cells<'_, T, D> {
         }
         self.x = rows.x_of(self.row, start, self.x, axes);
         self.run_count = 0;
-        for reached in axes[0].around(self.x) {
+        let cells = self.x..(self.x + self.grid.together).min(axes[0].count);
+        for reached in axes[0].around(cells.clone()) {
             if !reached.is_empty() {
                 for &row in &self.neighbours {
                     self.runs[self.run_count] = rows.cell_start(row, reached.start, axes)
@@ -354,7 +368,7 @@ impl<T: Scalar, const D: usize> Cells<'_, T, D> {
                 }
             }
         }
-        let end = rows.cell_start(self.row, self.x + 1, axes);
+        let end = rows.cell_start(self.row, cells.end, axes);
         self.slots.start = end.min(self.slots.end);
         Some(start..self.slots.start)
     }

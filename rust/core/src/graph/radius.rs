@@ -74,20 +74,17 @@ pub(super) fn within_cutoff<T: Scalar>(
 }
 
 /// Sorted particles searched as one task.
-const TASK: usize = 512;
+const TASK: usize = 1024;
 
-/// Particles below which starting other threads costs more than it saves: fewer in three
-/// dimensions, where each takes longer.
-const fn serial(dim: usize) -> usize {
-    if dim == 2 { 2048 } else { 768 }
-}
+/// Particles below which starting other threads costs more than it saves.
+const SERIAL: usize = 2048;
 
 fn build<T: Scalar, const D: usize>(
     batch: &Batch<'_, T, D>,
     cutoff: Cutoff<'_, T>,
     options: &Options,
 ) -> Result<Graph, Error> {
-    let threads = options.threads.unless(batch.positions.len() < serial(D));
+    let threads = options.threads.unless(batch.positions.len() < SERIAL);
     let budget = Budget::default();
     let searches = threads::map(threads, batch.graphs.clone(), |graph| {
         Search::new(batch, graph, cutoff, &budget)

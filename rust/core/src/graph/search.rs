@@ -119,7 +119,7 @@ impl<T: Scalar, const D: usize, const PERIODIC: bool, const UNIFORM: bool> Work
     fn run<const BLOCK: usize, L: Lanes<BLOCK>>(self, lanes: L) -> Self::Output {
         let mut rows = Rows::with_receivers(self.slots.len());
         let mut cells = self.search.grid.cells(self.slots);
-        // Those of the next cell are gathered before those of this one are looked at, since what
+        // Those of the next group are gathered before those of this one are looked at, since what
         // was just written can't be read in other blocks for a while.
         let (mut candidates, mut coming) = (Candidates::new(), Candidates::new());
         let mut receivers = 0..0;
@@ -151,8 +151,8 @@ impl<T: Scalar, const D: usize, const PERIODIC: bool, const UNIFORM: bool> Work
     }
 }
 
-/// The particles around a cell, packed, so that every particle of the cell goes through the
-/// same whole blocks.
+/// The particles around a group of cells, packed, so that every particle of the group goes
+/// through the same whole blocks.
 struct Candidates<T, const D: usize> {
     count: usize,
     /// Room for a block behind the candidates; there x is NaN, which is near to nothing.
