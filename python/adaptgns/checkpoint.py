@@ -102,7 +102,10 @@ def read_checkpoint(path: Path, *, device: str = "cpu") -> Checkpoint:
             header = archive.metadata() or {}
             tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"checkpoint {file}: cannot be read ({error})") from error
+        raise CheckpointError(
+            f"checkpoint {file}: cannot be read as .safetensors ({error}); rollouts (.h5) are for "
+            "evaluate and plot, other kinds of checkpoints for convert"
+        ) from error
     if header.get("format") != FORMAT:
         raise CheckpointError(
             f"checkpoint {file}: its format is {header.get('format')!r}; accepted is {FORMAT!r}"

@@ -36,6 +36,7 @@ COUNT: Range = ("whole numbers >= 1", lambda value: value >= 1)
 NOT_NEGATIVE: Range = ("finite numbers >= 0", lambda value: 0 <= value < math.inf)
 POSITIVE: Range = ("finite numbers > 0", lambda value: 0 < value < math.inf)
 SHARE: Range = ("numbers from 0 to 1", lambda value: 0 <= value <= 1)
+ABOVE_ZERO_TO_ONE: Range = ("numbers above 0, up to 1", lambda value: 0 < value <= 1)
 PERCENTILE: Range = ("numbers from 0 to 100", lambda value: 0 <= value <= 100)
 FACTOR: Range = ("finite numbers >= 1", lambda value: 1 <= value < math.inf)
 
@@ -108,7 +109,9 @@ class AdaptiveConfig:
     """Two-sided alone: how many times as far."""
 
     def __post_init__(self) -> None:
-        _require(self, tau=PERCENTILE, factor=FACTOR, low_tau=PERCENTILE, low_factor=SHARE)
+        _require(
+            self, tau=PERCENTILE, factor=FACTOR, low_tau=PERCENTILE, low_factor=ABOVE_ZERO_TO_ONE
+        )
 
 
 @dataclass(frozen=True)

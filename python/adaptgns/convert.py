@@ -183,6 +183,8 @@ def _convert_folder(config: ConvertConfig, console: Console) -> list[str]:
     source, dest = config.source, config.dest
     if config.to not in {None, "h5", "npz"}:
         raise DataError(f"to is {config.to}; h5 and npz are accepted for a data set")
+    if dest.suffix in {*_DATA, *_CHECKPOINTS}:
+        raise DataError(f"{dest}: the folder {source} can become a folder; got the name of a file")
     suffix = ".npz" if config.to == "npz" else ".h5"
     found = {split: path for split in SPELLINGS if (path := _find(source, split)) is not None}
     if not found:

@@ -82,6 +82,8 @@ def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
     """As :func:`evaluate`, neither writing nor printing."""
     if not files:
         raise ValueError("rollouts: got no file; expected one or more")
+    if not marks:
+        raise ValueError("steps: got none; one or more are accepted")
     if any(mark < 1 for mark in marks):
         raise ValueError(f"steps: got {list(marks)}; steps are counted from 1")
     marks = sorted(set(marks))

@@ -88,10 +88,11 @@ def read_geoelements(
                 f"checkpoint {path}: refused, since it asks for the global {asked[1]}; a "
                 "state_dict of tensors alone is accepted"
             ) from error
-        first_line = str(error).partition("\n")[0]
+        # Where names or shapes don't fit, torch says so in a line and which in the next.
+        first_lines = " ".join(" ".join(str(error).split("\n")[:2]).split())
         raise CheckpointError(
             f"checkpoint {path}: it is not a geoelements/gns state_dict that fits the metadata "
-            f"({type(error).__name__}: {first_line})"
+            f"({type(error).__name__}: {first_lines})"
         ) from error
     return simulator.eval()
 

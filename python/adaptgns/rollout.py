@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from adaptgns.checkpoint import read_checkpoint
+from adaptgns.checkpoint import Checkpoint, read_checkpoint
 from adaptgns.command import plain_errors
 from adaptgns.config import HISTORY, RolloutConfig, to_json, torch_device
 from adaptgns.data.default import dataset_folder
-from adaptgns.data.trajectories import Trajectory, open_split
+from adaptgns.data.metadata import read_metadata
+from adaptgns.data.trajectories import Trajectories, Trajectory, open_split
 from adaptgns.network import Prediction
 from adaptgns.policies import Edges, Policy, State, make_policy
 from adaptgns.rollout_file import RolloutWriter
@@ -178,13 +179,26 @@ def directed_edges(edges: Edges, self_edges: bool) -> int:
     return int(index.shape[1]) - (len(offsets) - 1) * self_edges
 
 
+def open_data(
+    checkpoint: Checkpoint, data: str | None, split: str, console: Console
+) -> Trajectories:
+    """A split of ``data``, or of what the model was trained on; tells what the model takes to be
+    otherwise than it is there.
+
+    DataError where there is none, or none that the model can step forward.
+    """
+    folder = dataset_folder(data or checkpoint.config.data)
+    for note in checkpoint.metadata.check_suits(read_metadata(folder), folder):
+        console.print(f"note: {note}", highlight=False, soft_wrap=True)
+    return open_split(folder, split)
+
+
 def write_rollouts(config: RolloutConfig, console: Console) -> None:
     """Roll out the trajectories that ``config`` asks for, and write them to ``config.out``."""
     checkpoint = read_checkpoint(config.checkpoint)
     simulator = checkpoint.simulator().to(torch_device(config.device))
     simulator.network.precision = config.precision
-    folder = dataset_folder(config.data or checkpoint.config.data)
-    split = open_split(folder, config.split)
+    split = open_data(checkpoint, config.data, config.split, console)
     count = len(split) if config.trajectories is None else min(config.trajectories, len(split))
     network = "GNS" if simulator.config.edges else "MLP"
     settings = {

@@ -262,6 +262,12 @@ class RolloutFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        if path.is_dir():
+            held = ", ".join(str(file) for file in sorted(path.rglob("*.h5"))[:3])
+            raise RolloutFileError(
+                f"rollout file {path}: is a folder; a file is accepted"
+                + (f", such as {held}" if held else "")
+            )
         if not path.is_file():
             raise FileNotFoundError(f"rollout file {path}: there is no such file")
         try:
@@ -276,7 +282,7 @@ class RolloutFile:
             self._file.close()
             raise RolloutFileError(
                 f"rollout file {path}: its format is {found}; accepted is {FORMAT!r} version "
-                f"{VERSION}"
+                f"{VERSION}, which python -m adaptgns.rollout writes"
             )
         self.metadata: Metadata = Metadata.from_json(json.loads(attributes["metadata"]))
         self.settings: dict[str, Any] = json.loads(attributes["settings"])

@@ -36,12 +36,11 @@ from adaptgns.atomic import write_json
 from adaptgns.checkpoint import read_checkpoint
 from adaptgns.command import plain_errors
 from adaptgns.config import HISTORY, AdaptiveConfig, Device, to_json, torch_device
-from adaptgns.data.default import dataset_folder
-from adaptgns.data.trajectories import Trajectories, open_split
+from adaptgns.data.trajectories import Trajectories
 from adaptgns.figures import STYLE, save
 from adaptgns.metrics import clumping, edge_counts, position_mse
 from adaptgns.policies import Adaptive
-from adaptgns.rollout import steps
+from adaptgns.rollout import open_data, steps
 from adaptgns.simulator import Simulator
 
 JOURNAL, RESULT, HEAT_MAP = "journal.log", "sweep.json", "sweep"
@@ -109,11 +108,11 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
     """
     checkpoint = read_checkpoint(config.checkpoint)
     simulator = checkpoint.simulator().to(torch_device(config.device))
-    split = open_split(dataset_folder(config.data or checkpoint.config.data), config.split)
+    split = open_data(checkpoint, config.data, config.split, console)
     config = replace(config, radius=config.radius or (simulator.radius,))
     space = {"tau": config.tau, "factor": config.factor, "radius": config.radius}
     config.out.mkdir(parents=True, exist_ok=True)
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.CRITICAL)
     study = optuna.create_study(
         study_name="adaptgns",
         storage=_storage(config),

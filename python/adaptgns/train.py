@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 f"  python -m adaptgns.train --resume {folder}",
                 markup=False,
             )
-            raise SystemExit(1) from None
+            raise SystemExit(130) from None
 
 
 def parse(arguments: list[str]) -> TrainConfig:
@@ -116,7 +116,12 @@ def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path
         torch.set_num_threads(threads)
     with group.first_ahead():  # to make or complete what all read, and to tell what is wrong
         data = dataset_folder(config.data)
-        metadata = read_metadata(data) if checkpoint is None else checkpoint.metadata
+        metadata = read_metadata(data)
+        if checkpoint is not None and metadata != checkpoint.metadata:
+            raise ValueError(
+                f"data: {data} is not what the run in {config.resume} was started with, by its "
+                "metadata.json; accepted is the same data, wherever it lies"
+            )
         train_split, valid_split, test_split = (
             open_split(data, split) for split in ("train", "valid", "test")
         )

@@ -85,6 +85,7 @@ def test_a_run_is_resumed_with_what_its_weights_are_made_for(
         ("--noise", "0.1", "noise: the run was started with 0.00067; got 0.1"),
         ("--model.latent", "8", "latent: the run was started with 16; got 8"),
         ("--steps", "1", "steps: the run has trained 2 steps; got 1"),
+        ("--data", "sand", "is not what the run"),
     ):
         with pytest.raises(SystemExit) as exit_:
             main(["--resume", str(tmp_path), option, value])

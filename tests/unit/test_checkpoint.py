@@ -72,7 +72,7 @@ def test_missing_and_damaged_files_are_named(checkpoint: Checkpoint, tmp_path: P
     path = tmp_path / LAST
     write_checkpoint(path, checkpoint)
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(CheckpointError, match=r"last\.safetensors: cannot be read"):
+    with pytest.raises(CheckpointError, match=r"last\.safetensors: cannot be read as"):
         read_checkpoint(path)
 
 

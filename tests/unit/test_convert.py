@@ -294,6 +294,10 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_split(tmp_path / "two.h5", trajectories(properties=2))
     told = refusal(capsys, tmp_path / "two.h5", tmp_path / "out.npz")
     assert "2 material properties; geoelements/gns, whose format this is, takes at most 1" in told
+    (tmp_path / "set").mkdir()
+    write_split(tmp_path / "set" / "train.h5", trajectories())
+    told = refusal(capsys, tmp_path / "set", out)
+    assert "can become a folder; got the name of a file" in told
     (tmp_path / "empty").mkdir()
     assert "the folder is empty" in refusal(capsys, tmp_path / "empty", tmp_path / "o")
     with pytest.raises(SystemExit):

@@ -145,6 +145,8 @@ def test_only_the_same_trajectories_are_compared(tmp_path: Path, metadata: Metad
     fewer = write_rollout(tmp_path / "fewer.h5", metadata, trajectories=1)
     with pytest.raises(ValueError, match=r"a\.h5 and .*fewer\.h5 .*hold 2 and 1 trajectories"):
         measure([first, fewer])
+    with pytest.raises(ValueError, match="steps: got none"):
+        measure([first], [])
     other = write_rollout(tmp_path / "other.h5", metadata)
     with h5py.File(other, "r+") as file:
         file["00001/initial"][0, 0, 0] += 0.01

@@ -178,7 +178,7 @@ def test_a_still_axis_has_no_usable_statistics(tmp_path: Path) -> None:
     still = random_walk(0)
     still.positions[..., 1] = 0.5
     write_split(tmp_path / "train.h5", [still])
-    with pytest.raises(DataError, match=r"vel_std is.*above 0"):
+    with pytest.raises(DataError, match=r"vel_std of the train split is.*above 0"):
         read_metadata(save(tmp_path, without(GNS, *STATISTICS)))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +27,8 @@ from adaptgns.config import (
     RolloutConfig,
     TrainConfig,
 )
-from adaptgns.data.metadata import Metadata, read_metadata
+from adaptgns.data.errors import DataError
+from adaptgns.data.metadata import Metadata, read_metadata, write_metadata
 from adaptgns.data.trajectories import Trajectory, open_split
 from adaptgns.policies import Adaptive, Edges, Fixed, State, make_policy
 from adaptgns.rollout import main, steps, write_rollouts
@@ -254,6 +257,39 @@ def test_wrong_options_are_told_plainly(capsys: pytest.CaptureFixture[str]) -> N
         main(["--checkpoint", "run", "--out", "x.h5", "--steps", "0"])
     assert exit_.value.code == 2
     assert "steps: got 0; accepted are whole numbers >= 1" in capsys.readouterr().err
+
+
+def test_data_must_suit_the_model(metadata: Metadata) -> None:
+    where = Path("elsewhere")
+    assert metadata.check_suits(metadata, where) == []
+    for change, told in (
+        ({"periodic": (True, False)}, "elsewhere: periodic is (True, False); the model was"),
+        ({"material_properties": 1}, "material_properties is 1; the model was trained with 0"),
+    ):
+        with pytest.raises(DataError, match=re.escape(told)):
+            metadata.check_suits(replace(metadata, **change), where)
+    slower = replace(metadata, dt=0.01, velocity_std=(1.0, 1.0))
+    assert metadata.check_suits(slower, where) == [
+        "elsewhere: dt is 0.01; the model goes by 0.0025, with which it was trained"
+    ]
+
+
+def test_what_the_model_takes_otherwise_is_told(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = json.loads((drops / "metadata.json").read_text())
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "test.h5").write_bytes((drops / "test.h5").read_bytes())
+    write_metadata(other, content | {"default_connectivity_radius": 0.02})
+    options = ["--checkpoint", "waterdrop", "--data", str(other), "--trajectories", "1"]
+    main([*options, "--steps", "2", "--out", str(tmp_path / "r.h5")])
+    assert "note: " in (out := capsys.readouterr().out)
+    assert "radius is 0.02; the model goes by 0.015" in out
+    write_metadata(other, content | {"periodic_boundary_conditions": [True, False]})
+    with pytest.raises(SystemExit):
+        main([*options, "--out", str(tmp_path / "s.h5")])
+    assert "periodic is (True, False)" in capsys.readouterr().err
 
 
 def test_a_file_that_is_there_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -110,6 +110,8 @@ def test_only_whole_rollout_files_are_read(tmp_path: Path, metadata: Metadata) -
     path = write_rollout(tmp_path / "r.h5", metadata)
     with pytest.raises(FileNotFoundError, match=r"none\.h5: there is no such file"):
         RolloutFile(tmp_path / "none.h5")
+    with pytest.raises(RolloutFileError, match=r"is a folder; a file is accepted, such as .*r\.h5"):
+        RolloutFile(tmp_path)
     (tmp_path / "cut.h5").write_bytes(path.read_bytes()[:-1000])
     with pytest.raises(RolloutFileError, match=r"cut\.h5: not a whole HDF5 file"):
         RolloutFile(tmp_path / "cut.h5")

@@ -148,6 +148,11 @@ def test_what_is_refused(
 
     assert "error: every: got 0; accepted is 1 or more" in told("--every", "0")
     assert "error: trajectory: got 5; " in told("--trajectory", "5")
+    old = tmp_path / "old"
+    main(["vtk", str(adaptive), "--out", str(old), "--every", "10"])
+    with pytest.raises(SystemExit):
+        main(["vtk", str(adaptive), "--out", str(old)])
+    assert "old: holds frames already; remove it or name another" in capsys.readouterr().err
     with h5py.File(adaptive, "r+") as file:
         file["00000/predicted"][6:, 0] = np.nan
     assert "positions that are not finite from step 7 on" in told()

@@ -7,6 +7,7 @@ import json
 import os
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,6 +95,14 @@ def generate_dataset(
         raise DataError(f"splits are {', '.join(plans)}; train is needed, for the statistics")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    try:
+        _generate(folder, plans, console)
+    finally:
+        with suppress(OSError):
+            folder.rmdir()  # where nothing came of it
+
+
+def _generate(folder: Path, plans: Mapping[str, SplitPlan], console: Console) -> None:
     finished = [split for split, plan in plans.items() if _is_finished(folder, split, plan)]
     _refuse_foreign_metadata(folder)
     statistics = None

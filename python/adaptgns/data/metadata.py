@@ -65,6 +65,32 @@ class Metadata:
         """Which particles of these types `[N]` are not kinematic, bool `[N]`."""
         return ~np.isin(particle_type, self.kinematic_types)
 
+    def check_suits(self, data: Metadata, source: Path) -> list[str]:
+        """What a user should know who gives a model that was trained on this the `data` in
+        `source`: in what they differ.
+
+        Raises:
+            DataError: they differ in what a model can't do without.
+        """
+        different = {
+            field.name: (getattr(self, field.name), getattr(data, field.name))
+            for field in fields(self)
+            if getattr(self, field.name) != getattr(data, field.name)
+        }
+        for name in ("dim", "periodic", "material_properties"):
+            if name in different:
+                trained, given = different[name]
+                raise DataError(
+                    f"{source}: {name} is {given}; the model was trained with {trained} and "
+                    "accepts no other"
+                )
+        return [
+            f"{source}: {name} is {different[name][1]}; the model goes by {different[name][0]}, "
+            "with which it was trained"
+            for name in ("dt", "bounds", "radius", "kinematic_types")
+            if name in different
+        ]
+
     def to_json(self) -> dict[str, Any]:
         """Plain values that `from_json` reads back exactly."""
         return asdict(self)
@@ -176,9 +202,17 @@ def _compute(
         train = open_split(folder, "train")
     except DataError as error:
         raise DataError(f"no motion statistics, and none can be computed: {error}") from error
-    return compute_statistics(
+    statistics = compute_statistics(
         train, box=period_lengths(bounds, periodic), kinematic_types=kinematic
     )
+    for ours in ("velocity_std", "acceleration_std"):
+        deviations = getattr(statistics, ours)
+        if not all(value > 0 for value in deviations):
+            raise DataError(
+                f"{FILE_KEYS[ours]} of the train split is {list(deviations)}; numbers above 0 are "
+                "accepted: from motion that never changes nothing can be learned"
+            )
+    return statistics
 
 
 def _write_back(path: Path, content: dict[str, Any], metadata: Metadata) -> None:

@@ -145,7 +145,9 @@ def _contents(folder: Path) -> str:
         return "there is no such folder" if not folder.exists() else "it isn't a folder"
     names = sorted(entry.name for entry in folder.iterdir())
     shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-    return f"the folder holds {shown}" if names else "the folder is empty"
+    others = any(Path(name).suffix in {".tfrecord", ".vtu", ".vtk", ".ply"} for name in names)
+    hint = "; python -m adaptgns.convert reads other kinds" if others else ""
+    return f"the folder holds {shown}{hint}" if names else "the folder is empty"
 
 
 def _declared_dim(folder: Path) -> int | None:
