@@ -27,7 +27,7 @@ from adaptgns.vtk_series import write_series
 class AnimateConfig:
     """Animate one trajectory of a rollout file: truth on the left, prediction on the right."""
 
-    rollout: Path
+    rollout: tyro.conf.Positional[Path]
     """Rollout file (HDF5)."""
     out: Path
     """GIF or MP4 file to write."""

@@ -104,7 +104,7 @@ def test_without_its_package_or_with_another_suffix_no_film(
     }
     for name, message in told.items():
         with pytest.raises(SystemExit, match="2"):
-            main(["animate", "--rollout", str(adaptive), "--out", str(tmp_path / name)])
+            main(["animate", str(adaptive), "--out", str(tmp_path / name)])
         assert message in capsys.readouterr().err
         assert not (tmp_path / name).exists()
 
@@ -119,7 +119,7 @@ def test_without_a_program_no_film(
     monkeypatch.delenv("IMAGEIO_FFMPEG_EXE", raising=False)
     monkeypatch.setattr(imageio_ffmpeg._utils, "_get_ffmpeg_exe", lambda: None)
     with pytest.raises(SystemExit, match="2"):
-        main(["animate", "--rollout", str(adaptive), "--out", str(tmp_path / "a.mp4")])
+        main(["animate", str(adaptive), "--out", str(tmp_path / "a.mp4")])
     told = capsys.readouterr().err
     assert "which imageio-ffmpeg doesn't bring for this machine: install ffmpeg" in told
     assert told.count("\n") == 1
@@ -175,11 +175,11 @@ def test_what_is_not_finite_is_refused(tmp_path: Path, adaptive: Path) -> None:
 
 def test_command(tmp_path: Path, adaptive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "a.gif"
-    main(["animate", "--rollout", str(adaptive), "--out", str(out), "--every", "6"])
+    main(["animate", str(adaptive), "--out", str(out), "--every", "6"])
     assert out.stat().st_size > 1000
     for wrong in (["--trajectory", "2"], ["--every", "0"]):
         with pytest.raises(SystemExit) as stopped:
-            main(["animate", "--rollout", str(adaptive), "--out", str(out), *wrong])
+            main(["animate", str(adaptive), "--out", str(out), *wrong])
         assert stopped.value.code == 2
     assert "error: every, fps: got 0" in capsys.readouterr().err
 
