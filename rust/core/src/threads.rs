@@ -24,13 +24,13 @@ pub enum Threads {
 }
 
 impl Threads {
-    /// The calling thread alone if `small`.
-    pub fn unless(self, small: bool) -> Self {
-        if small {
-            Self::AtMost(NonZeroUsize::MIN)
-        } else {
-            self
-        }
+    /// At most `count` of them, and at least one.
+    pub fn at_most(self, count: usize) -> Self {
+        let most = match self {
+            Self::All => count,
+            Self::AtMost(limit) => limit.get().min(count),
+        };
+        Self::AtMost(NonZeroUsize::new(most).unwrap_or(NonZeroUsize::MIN))
     }
 }
 
@@ -84,68 +84,6 @@ fn helpers() -> &'static Helpers {
     }
 }
 
-/// `task` of every item, in the order of the items, computed by up to `threads` threads.
-pub fn map<I: Send, R: Send>(
-    threads: Threads,
-    items: Vec<I>,
-    task: impl Fn(I) -> R + Sync,
-) -> Vec<R> {
-    let Some((_, pool, spawned)) = helpers_for(threads, items.len()) else {
-        return items.into_iter().map(task).collect();
-    };
-    share(items, task, |work| {
-        pool.in_place_scope(|scope| {
-            for _ in 0..spawned {
-                scope.spawn(|_| work());
-            }
-            work();
-        });
-    })
-}
-
-/// The helpers, and how many of their pool may help with `count` items; `None` if the caller works
-/// alone, as it does beside a [`team`]: waiting for that would take longer.
-fn helpers_for(
-    threads: Threads,
-    count: usize,
-) -> Option<(&'static Helpers, &'static ThreadPool, usize)> {
-    let wanted = match threads {
-        Threads::All => usize::MAX,
-        Threads::AtMost(limit) => limit.get(),
-    };
-    if wanted < 2 || count < 2 {
-        return None;
-    }
-    let helpers = helpers();
-    if helpers.taken.load(Ordering::Relaxed) {
-        return None;
-    }
-    let spawned = helpers.count.min(wanted - 1).min(count - 1);
-    helpers.pool.as_ref().map(|pool| (helpers, pool, spawned))
-}
-
-/// `task` of every item, in order; `run` calls what it is given on as many threads as it likes.
-fn share<I: Send, R: Send>(
-    items: Vec<I>,
-    task: impl Fn(I) -> R + Sync,
-    run: impl FnOnce(&(dyn Fn() + Sync)),
-) -> Vec<R> {
-    let finished = Mutex::new(Vec::with_capacity(items.len()));
-    let waiting = Mutex::new(items.into_iter().enumerate());
-    run(&|| {
-        let mut mine = Vec::new();
-        loop {
-            let next = lock(&waiting).next();
-            let Some((i, item)) = next else { break };
-            mine.push((i, task(item)));
-        }
-        lock(&finished).append(&mut mine);
-    });
-    let mut results = std::mem::take(&mut *lock(&finished));
-    results.sort_unstable_by_key(|&(i, _)| i);
-    results.into_iter().map(|(_, result)| result).collect()
-}
-
 /// Threads that stay awake from one [`Team::map`] to the next: waking them costs more than a short
 /// one takes.
 pub struct Team {
@@ -168,10 +106,17 @@ struct Helped<'t>(&'t Team);
 // it, `work`, which its owner does not change then; `count` is the owner's.
 unsafe impl Sync for Helped<'_> {}
 
-/// What `body` returns, which may share its work with up to `threads` threads.
+/// What `body` returns, which may share its work with up to `threads` threads; it works alone where
+/// another team has the helpers, since waiting for that would take longer.
 pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
-    let helpers = helpers_for(threads, usize::MAX)
-        .filter(|(helpers, ..)| !helpers.taken.swap(true, Ordering::Relaxed));
+    let wanted = match threads {
+        Threads::All => usize::MAX,
+        Threads::AtMost(limit) => limit.get(),
+    };
+    let helpers = (wanted > 1)
+        .then(helpers)
+        .and_then(|helpers| Some((helpers, helpers.pool.as_ref()?)))
+        .filter(|(helpers, _)| !helpers.taken.swap(true, Ordering::Relaxed));
     let team = Team {
         work: UnsafeCell::new(None),
         open: AtomicUsize::new(0),
@@ -180,7 +125,7 @@ pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
         over: AtomicBool::new(false),
         helped: helpers.is_some(),
     };
-    let Some((helpers, pool, spawned)) = helpers else {
+    let Some((helpers, pool)) = helpers else {
         return body(&team);
     };
     let _given_back = OnDrop(|| helpers.taken.store(false, Ordering::Relaxed));
@@ -188,7 +133,7 @@ pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
     pool.in_place_scope(|scope| {
         // Also where `body` panics: the scope waits for the helpers.
         let _over = OnDrop(|| team.over.store(true, Ordering::Release));
-        for _ in 0..spawned {
+        for _ in 0..helpers.count.min(wanted - 1) {
             scope.spawn(|_| helped.help());
         }
         body(&team)
@@ -235,25 +180,40 @@ impl Team {
         if !self.helped || items.len() < 2 {
             return items.into_iter().map(task).collect();
         }
-        share(items, task, |work| {
-            // SAFETY: only the lifetime changes, and nobody uses it after `closed` below, which is
-            // dropped before `work` ends.
-            let work: *const (dyn Fn() + Sync) = unsafe {
-                std::mem::transmute::<&(dyn Fn() + Sync), &'static (dyn Fn() + Sync)>(work)
-            };
-            // SAFETY: nothing is open and nobody active, so no helper looks.
-            unsafe { *self.work.get() = Some(work) };
-            self.count.set(self.count.get() + 1);
-            self.open.store(self.count.get(), Ordering::SeqCst);
-            let _closed = OnDrop(|| {
-                self.open.store(0, Ordering::SeqCst);
-                while self.active.load(Ordering::SeqCst) > 0 {
-                    std::hint::spin_loop();
-                }
-            });
-            // SAFETY: it is alive, see above.
-            unsafe { (*work)() };
-        })
+        let finished = Mutex::new(Vec::with_capacity(items.len()));
+        let waiting = Mutex::new(items.into_iter().enumerate());
+        self.all(&|| {
+            let mut mine = Vec::new();
+            loop {
+                let next = lock(&waiting).next();
+                let Some((i, item)) = next else { break };
+                mine.push((i, task(item)));
+            }
+            lock(&finished).append(&mut mine);
+        });
+        let mut results = std::mem::take(&mut *lock(&finished));
+        results.sort_unstable_by_key(|&(i, _)| i);
+        results.into_iter().map(|(_, result)| result).collect()
+    }
+
+    /// Does `work` on every thread of the team, which shares it out itself.
+    fn all(&self, work: &(dyn Fn() + Sync)) {
+        // SAFETY: only the lifetime changes, and nobody uses it after `closed` below, which is
+        // dropped before `work` ends.
+        let work: *const (dyn Fn() + Sync) =
+            unsafe { std::mem::transmute::<&(dyn Fn() + Sync), &'static (dyn Fn() + Sync)>(work) };
+        // SAFETY: nothing is open and nobody active, so no helper looks.
+        unsafe { *self.work.get() = Some(work) };
+        self.count.set(self.count.get() + 1);
+        self.open.store(self.count.get(), Ordering::SeqCst);
+        let _closed = OnDrop(|| {
+            self.open.store(0, Ordering::SeqCst);
+            while self.active.load(Ordering::SeqCst) > 0 {
+                std::hint::spin_loop();
+            }
+        });
+        // SAFETY: it is alive, see above.
+        unsafe { (*work)() };
     }
 }
 
@@ -300,10 +260,8 @@ mod tests {
         };
         team(Threads::All, |_| {
             std::thread::scope(|scope| {
-                // Neither waits for the team around it, which ends after them.
+                // It doesn't wait for the team around it, which ends after it.
                 assert!(scope.spawn(|| shares(Threads::All)).join().unwrap());
-                let mapped = scope.spawn(|| map(Threads::All, vec![1, 2, 3], |x| 2 * x));
-                assert_eq!(mapped.join().unwrap(), [2, 4, 6]);
             });
         });
         assert_eq!(

@@ -7,7 +7,7 @@ use super::lanes::{LONGEST, Lanes, Work, widest};
 use super::memory::{Budget, filled, reserve};
 use super::order::{NONE, write_sorted};
 use crate::Error;
-use crate::threads::{self, Threads};
+use crate::threads::Team;
 
 /// The senders of some receivers, row after row, each in any order.
 pub(super) struct Rows {
@@ -82,7 +82,7 @@ pub(super) fn assemble(
     particles: usize,
     parts: &[(&[i32], &Rows)],
     drop_self: bool,
-    threads: Threads,
+    team: &Team,
     budget: &Budget,
 ) -> Result<Graph, Error> {
     // First how many edges each receiver has, behind its place, then their sums.
@@ -122,7 +122,7 @@ pub(super) fn assemble(
             receivers: receivers.split_off_mut(..edges).expect("edges left"),
         });
     }
-    threads::map(threads, tasks, widest);
+    team.map(tasks, widest);
     // SAFETY: the tasks' rows partition both halves, and each wrote all of its part.
     unsafe { edge_index.set_len(2 * edges) };
     Ok(Graph {

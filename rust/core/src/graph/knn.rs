@@ -55,32 +55,33 @@ fn build<T: Nearest, const D: usize>(
     let count = batch.positions.len();
     let budget = Budget::default();
     budget.check(count * k)?;
-    let threads = options.threads.unless(count < 2 * TASK);
-    let searches = threads::map(threads, batch.graphs.clone(), |graph| {
-        Search::new(batch, graph, k)
+    threads::team(options.threads.at_most(count / TASK), |team| {
+        let searches = team
+            .map(batch.graphs.clone(), |graph| Search::new(batch, graph, k))
+            .into_iter()
+            .collect::<Result<Vec<_>, _>>()?;
+        let tasks: Vec<(&Search<T, D>, Range<usize>)> = searches
+            .iter()
+            .flat_map(|search| {
+                let n = search.locations.len();
+                (0..n)
+                    .step_by(TASK)
+                    .map(move |start| (search, start..n.min(start + TASK)))
+            })
+            .collect();
+        let found = team
+            .map(tasks.clone(), |(search, locations)| {
+                search.run(locations, options.self_edges, &budget)
+            })
+            .into_iter()
+            .collect::<Result<Vec<_>, _>>()?;
+        let parts: Vec<(&[i32], &Rows)> = tasks
+            .iter()
+            .map(|(search, locations)| search.members_of(locations.clone()))
+            .zip(&found)
+            .collect();
+        edges::assemble(count, &parts, false, team, &budget)
     })
-    .into_iter()
-    .collect::<Result<Vec<_>, _>>()?;
-    let tasks: Vec<(&Search<T, D>, Range<usize>)> = searches
-        .iter()
-        .flat_map(|search| {
-            let n = search.locations.len();
-            (0..n)
-                .step_by(TASK)
-                .map(move |start| (search, start..n.min(start + TASK)))
-        })
-        .collect();
-    let found = threads::map(threads, tasks.clone(), |(search, locations)| {
-        search.run(locations, options.self_edges, &budget)
-    })
-    .into_iter()
-    .collect::<Result<Vec<_>, _>>()?;
-    let parts: Vec<(&[i32], &Rows)> = tasks
-        .iter()
-        .map(|(search, locations)| search.members_of(locations.clone()))
-        .zip(&found)
-        .collect();
-    edges::assemble(count, &parts, false, threads, &budget)
 }
 
 /// One graph. Particles at the same place are one location, so that a pile of them

@@ -76,47 +76,49 @@ pub(super) fn within_cutoff<T: Scalar>(
 /// Sorted particles searched as one task.
 const TASK: usize = 1024;
 
-/// Particles below which starting other threads costs more than it saves.
-const SERIAL: usize = 2048;
+/// Particles below which waking other threads costs more than it saves.
+const SERIAL: usize = 6 * TASK;
 
 fn build<T: Scalar, const D: usize>(
     batch: &Batch<'_, T, D>,
     cutoff: Cutoff<'_, T>,
     options: &Options,
 ) -> Result<Graph, Error> {
-    let threads = options.threads.unless(batch.positions.len() < SERIAL);
-    let budget = Budget::default();
-    let searches = threads::map(threads, batch.graphs.clone(), |graph| {
-        Search::new(batch, graph, cutoff, &budget)
+    let count = batch.positions.len();
+    let tasks = if count < SERIAL {
+        1
+    } else {
+        count.div_ceil(TASK)
+    };
+    // The others wake while the particles are sorted.
+    threads::team(options.threads.at_most(tasks), |team| {
+        let budget = Budget::default();
+        let searches = team
+            .map(batch.graphs.clone(), |graph| {
+                Search::new(batch, graph, cutoff, &budget)
+            })
+            .into_iter()
+            .collect::<Result<Vec<_>, _>>()?;
+        let tasks: Vec<(&Search<T, D>, Range<usize>)> = searches
+            .iter()
+            .flat_map(|search| {
+                let n = search.index().len();
+                (0..n)
+                    .step_by(TASK)
+                    .map(move |start| (search, start..n.min(start + TASK)))
+            })
+            .collect();
+        let found = team
+            .map(tasks.clone(), |(search, slots)| search.run(slots, &budget))
+            .into_iter()
+            .collect::<Result<Vec<_>, _>>()?;
+        let parts: Vec<(&[i32], &Rows)> = tasks
+            .iter()
+            .map(|(search, slots)| &search.index()[slots.clone()])
+            .zip(&found)
+            .collect();
+        edges::assemble(count, &parts, !options.self_edges, team, &budget)
     })
-    .into_iter()
-    .collect::<Result<Vec<_>, _>>()?;
-    let tasks: Vec<(&Search<T, D>, Range<usize>)> = searches
-        .iter()
-        .flat_map(|search| {
-            let n = search.index().len();
-            (0..n)
-                .step_by(TASK)
-                .map(move |start| (search, start..n.min(start + TASK)))
-        })
-        .collect();
-    let found = threads::map(threads, tasks.clone(), |(search, slots)| {
-        search.run(slots, &budget)
-    })
-    .into_iter()
-    .collect::<Result<Vec<_>, _>>()?;
-    let parts: Vec<(&[i32], &Rows)> = tasks
-        .iter()
-        .map(|(search, slots)| &search.index()[slots.clone()])
-        .zip(&found)
-        .collect();
-    edges::assemble(
-        batch.positions.len(),
-        &parts,
-        !options.self_edges,
-        threads,
-        &budget,
-    )
 }
 
 #[cfg(test)]
