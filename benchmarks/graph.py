@@ -1,7 +1,7 @@
 """Time the graph builders side by side with their peers.
 
     python benchmarks/graph.py [--out benchmarks/results/graph.json] [--quick]
-    python benchmarks/graph.py --plot benchmarks/results/graph.json
+    python benchmarks/graph.py --plot benchmarks/results/graph.json  # and the README's table
 
 Each line is one system of uniformly random particles, its radius chosen for a mean degree.
 Builders take turns in one process, so that a busy machine slows all of them alike; figures are
@@ -50,7 +50,7 @@ COST = [(10_000, 2, 6.8), (10_000_000, 2, 6.8)]
 LARGEST_OF_PEERS = 1_000_000
 PEERS = ("scipy", "vesin", "matscipy", "freud", "torch_cluster")
 TAU, FACTOR = 70.0, 1.267
-
+SIGMAS = ("random", "smooth")
 
 SLOW = 2.0
 """Seconds of a call above which it is timed once"""
@@ -181,7 +181,7 @@ def measure(
         "bytes moved at least": moved,
         "share of the roofline": roofline / times["base"],
         "adaptive over base": {
-            name: times[f"adaptive, {name} sigma"] / times["base"] for name in ("random", "smooth")
+            name: times[f"adaptive, {name} sigma"] / times["base"] for name in SIGMAS
         },
         "adaptive over base per edge, random sigma": per_edge("adaptive, random sigma", random),
         "adaptive over base per edge, smooth sigma": per_edge("adaptive, smooth sigma", smooth),
@@ -230,6 +230,34 @@ def plot(results: Path) -> Path:
     return path
 
 
+def _three_digits(value: float) -> str:
+    return f"{value:.3g}" if value < 100 else f"{float(f'{value:.3g}'):,.0f}"
+
+
+def table(results: Path) -> str:
+    """Milliseconds of ours and of each peer, and how many times as long it took, in Markdown."""
+    rows = [r for r in json.loads(results.read_text())["systems"] if r["dtype"] == "float32"]
+    names = [name for name in PEERS if any(name in r["over base"] for r in rows)]
+    lines = [
+        "| particles | neighbours | AdaptGNS | " + " | ".join(names) + " | adaptive, per edge |",
+        "|" + "---|" * (len(names) + 4),
+    ]
+    for row in sorted(rows, key=lambda row: (row["dimensions"], row["particles"])):
+        times, over = row["milliseconds"], row["over base"]
+        cells = [
+            f"{row['particles']:,} in {row['dimensions']}D",
+            f"{row['mean degree']:.1f}",
+            f"{_three_digits(times['base'])} ms",
+            *(
+                f"{_three_digits(times[n])} ms, {_three_digits(over[n])}×" if n in over else "–"
+                for n in names
+            ),
+            f"{max(row[f'adaptive over base per edge, {s} sigma'] for s in SIGMAS):.2f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, help="where to write the figures as JSON")
@@ -237,7 +265,7 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, help="draw the figures of this JSON, measure nothing")
     options = parser.parse_args()
     if options.plot:
-        print(plot(options.plot))
+        print(plot(options.plot), table(options.plot), sep="\n")
         return
     per_second = bandwidth()
     versions = {name: version(name) for name in ("numpy", "scipy")}
