@@ -206,7 +206,7 @@ PROFILES: dict[ProfileName, Profile] = {
     ),
     "laptop": Profile(
         base=PRESETS["laptop"],
-        models=(MSE, NLL, MLP, *EARLY, ADAPTIVE_NLL, DECOUPLED, TUNED),
+        models=(MSE, NLL, MLP, *EARLY, ADAPTIVE_NLL, TUNED),
         sweep=Sweep(trajectories=5),
         seeds=(0, 1, 2),
         marks=(50, 100, 200),

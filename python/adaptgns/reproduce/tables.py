@@ -64,6 +64,16 @@ COMPARISONS: tuple[Comparison, ...] = (
         ("nll-adaptive", "adaptive"),
         ("nll-adaptive", "fixed"),
     ),
+    (
+        "uncertain or random, trained on adaptive graphs",
+        ("nll-adaptive", "adaptive"),
+        ("nll-adaptive", "random"),
+    ),
+    (
+        "trained on adaptive graphs, or fixed MSE: the aim",
+        ("nll-adaptive", "adaptive"),
+        ("mse", "fixed"),
+    ),
     ("sigma or the last acceleration, NLL", ("nll", "adaptive"), ("nll", "acceleration")),
     ("sigma or the divergence around, NLL", ("nll", "adaptive"), ("nll", "divergence")),
     ("the last acceleration or fixed, MSE", ("mse", "acceleration"), ("mse", "fixed")),
