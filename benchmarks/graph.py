@@ -188,9 +188,15 @@ def measure(
     }
 
 
+def _shown(results: Path) -> list[dict[str, Any]]:
+    """The systems in float32, small ones first, 2D before 3D."""
+    rows = [r for r in json.loads(results.read_text())["systems"] if r["dtype"] == "float32"]
+    return sorted(rows, key=lambda row: (row["dimensions"], row["particles"]))
+
+
 def plot(results: Path) -> Path:
     """How many times as fast as each peer, and the cost per particle."""
-    rows = [r for r in json.loads(results.read_text())["systems"] if r["dtype"] == "float32"]
+    rows = _shown(results)
     figure = Figure(figsize=(6.6, 2.8), layout="constrained")
     ratios, cost = figure.subplots(1, 2)
     for name, tint in zip(PEERS, SERIES, strict=False):
@@ -206,11 +212,11 @@ def plot(results: Path) -> Path:
                 label=name if d == 2 and own else None,
             )
     for d, dash in ((2, "-"), (3, "--")):
-        own = sorted(
+        own = [
             (r["particles"], r["base, nanoseconds per particle"])
             for r in rows
             if r["dimensions"] == d
-        )
+        ]
         cost.plot(
             *zip(*own, strict=True),
             color=SERIES[1],
@@ -221,6 +227,9 @@ def plot(results: Path) -> Path:
         )
     ratios.axhline(10, color="#9aa3ad", linewidth=0.8)
     ratios.set(title="time of a peer over ours (3D dashed)", xscale="log", yscale="log")
+    ratios.set_yticks([5, 10, 20, 50, 100, 200, 500], minor=False)
+    ratios.yaxis.set_major_formatter("{x:g}×")
+    ratios.yaxis.set_minor_formatter("")
     cost.set(title="nanoseconds per particle", xscale="log", ylim=(0, None))
     for axes in (ratios, cost):
         axes.set_xlabel("particles")
@@ -236,13 +245,13 @@ def _three_digits(value: float) -> str:
 
 def table(results: Path) -> str:
     """Milliseconds of ours and of each peer, and how many times as long it took, in Markdown."""
-    rows = [r for r in json.loads(results.read_text())["systems"] if r["dtype"] == "float32"]
+    rows = _shown(results)
     names = [name for name in PEERS if any(name in r["over base"] for r in rows)]
     lines = [
         "| particles | neighbours | AdaptGNS | " + " | ".join(names) + " | adaptive, per edge |",
         "|" + "---|" * (len(names) + 4),
     ]
-    for row in sorted(rows, key=lambda row: (row["dimensions"], row["particles"])):
+    for row in rows:
         times, over = row["milliseconds"], row["over base"]
         cells = [
             f"{row['particles']:,} in {row['dimensions']}D",
