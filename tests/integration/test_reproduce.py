@@ -147,6 +147,15 @@ def test_a_missing_run_is_told_and_the_report_stays(study: ReproduceConfig) -> N
     assert (folder(study) / "report.md").read_bytes() == before
 
 
+def test_a_step_that_was_not_timed_is_told(study: ReproduceConfig) -> None:
+    path = folder(study) / "metrics" / "waterdrop" / "times.json"
+    content = json.loads(path.read_text())
+    del content["times"]["nll, random"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"times\.json: has no step of nll, random; the command"):
+        reproduce(study, QUIET)
+
+
 @pytest.mark.parametrize(
     ("of", "name", "value"),
     [("training", "lr", 0.5), ("training", "seed", 7), ("rollout", "adaptive", {"tau": 60.0})],

@@ -207,7 +207,7 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                 error = series.estimate(f"mse@{mark}")
                 cost = series.scalar("edges_per_step").mean()
                 if unit.startswith("milli"):
-                    time = data.times["times"][f"{series.model.name}, {series.policy}"]
+                    time = data.step_time(series.model, series.policy)
                     cost = time["graph_ms"] + time["model_ms"]
                 ax.errorbar(
                     cost,

@@ -308,6 +308,16 @@ class DataSet:
         """What :meth:`time_steps` measured: by model and policy, and on what."""
         return read_json(self.metrics / "times.json")
 
+    def step_time(self, model: Model, policy: PolicyName) -> dict[str, float]:
+        """Of :attr:`times`, those of one model under one policy."""
+        name, times = f"{model.name}, {policy}", self.times["times"]
+        if name not in times:
+            raise StudyError(
+                f"{self.metrics / 'times.json'}: has no step of {name}; the command without "
+                "--report-only times it"
+            )
+        return times[name]  # type: ignore[no-any-return]
+
     def pass_gate(self, console: Console) -> None:
         """Find how long the fixed graph's baseline must train until it does not clump."""
         profile, path = self.study.profile, self.metrics / "gate.json"

@@ -168,10 +168,10 @@ def _statistics(results: Results) -> Table:
 
 def _rollouts(results: Results, data: DataSet) -> Table:
     mark, marks = results.study.last_mark, results.study.profile.marks
-    rows, times = [], data.times["times"]
+    rows = []
     where = str((data.metrics / "times.json").relative_to(results.study.out).as_posix())
     for series in results.of(data.name):
-        time = times[f"{series.model.name}, {series.policy}"]
+        time = data.step_time(series.model, series.policy)
         true = series.curve("edges_within_radius_true").mean()
         predicted = series.curve("edges_within_radius").mean()
         rows.append(
