@@ -33,7 +33,7 @@ COLOURS = {
     "nll-adaptive": SERIES[2],
     "beta-nll": SERIES[3],
     "mse-denser": SERIES[4],
-    "tuned": SERIES[2],
+    "tuned": "#b0528f",
     "decoupled": "#4f8f3a",
 }
 FIGURE_3 = (("mse", "fixed"), ("nll", "fixed"), ("nll", "adaptive"), ("nll", "random"))
