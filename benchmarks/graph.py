@@ -32,6 +32,7 @@ from machine import machine
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
+from adaptgns.atomic import replace_text
 from adaptgns.graph import adaptive_graph, radius_graph
 from adaptgns.palette import SERIES
 
@@ -307,8 +308,7 @@ def main() -> None:
                 f"{row['adaptive over base per edge, smooth sigma']:.2f} smooth"
             )
             if options.out:  # as far as it has come
-                options.out.parent.mkdir(parents=True, exist_ok=True)
-                options.out.write_text(json.dumps(result, indent=1) + "\n")
+                replace_text(options.out, json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,14 @@ from adaptgns.config import EdgeUpdate, TrainConfig
 from adaptgns.data.dataset import counts, refuse_taken
 from adaptgns.data.errors import DataError
 from adaptgns.data.frames import FrameFolders, holds_frames
-from adaptgns.data.metadata import FILE_NAME, GNS_KINEMATIC, Metadata, read_metadata, write_metadata
+from adaptgns.data.metadata import (
+    FILE_NAME,
+    GNS_KINEMATIC,
+    Metadata,
+    read_metadata,
+    training_section,
+    write_metadata,
+)
 from adaptgns.data.npz import NpzSource
 from adaptgns.data.npz_writer import write_npz
 from adaptgns.data.store import write_split
@@ -190,7 +197,7 @@ def _convert_folder(config: ConvertConfig, console: Console) -> list[str]:
     if not found:
         open_split(source, "train")  # its error says what the folder holds
     content = _content(source)
-    dim = config.dim or (None if content is None else _section(content).get("dim"))
+    dim = config.dim or (None if content is None else training_section(content).get("dim"))
     with folder_written_whole(dest) as partial:
         with progress_bar(console, "trajectories") as progress:
             for split, path in found.items():
@@ -220,15 +227,9 @@ def _content(folder: Path) -> dict[str, Any] | None:
     return content
 
 
-def _section(content: dict[str, Any]) -> dict[str, Any]:
-    """What describes the training data: geoelements/gns may have a section for it."""
-    train = content.get("train")
-    return train if isinstance(train, dict) else content
-
-
 def _write_metadata(folder: Path, content: dict[str, Any], suffix: str) -> list[str]:
     """Writes the metadata of a converted data set: what there was and its readers need."""
-    section = dict(_section(content))
+    section = dict(training_section(content))
     write_metadata(folder, section)
     metadata = read_metadata(folder)  # computes missing statistics
     section = json.loads((folder / FILE_NAME).read_bytes())
@@ -288,7 +289,7 @@ def _import_checkpoint(config: ConvertConfig) -> list[str]:
         )
     folder = config.metadata or path.parent
     metadata = read_metadata(folder)
-    clip = _section(_content(folder) or {}).get("boundary_augment", 1.0)
+    clip = training_section(_content(folder) or {}).get("boundary_augment", 1.0)
     if clip != 1.0:
         raise CheckpointError(
             f"checkpoint {path}: {folder / FILE_NAME} says boundary_augment {clip}; 1 is accepted"

@@ -19,7 +19,6 @@ from adaptgns.checkpoint import Checkpoint, read_checkpoint
 from adaptgns.command import plain_errors
 from adaptgns.config import HISTORY, RolloutConfig, to_json, torch_device
 from adaptgns.data.default import dataset_folder
-from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import Trajectories, Trajectory, open_split
 from adaptgns.network import Prediction
 from adaptgns.policies import Edges, Policy, State, make_policy
@@ -188,7 +187,7 @@ def open_data(
     DataError where there is none, or none that the model can step forward.
     """
     folder = dataset_folder(data or checkpoint.config.data)
-    for note in checkpoint.metadata.check_suits(read_metadata(folder), folder):
+    for note in checkpoint.metadata.check_suits(folder):
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
     return open_split(folder, split)
 

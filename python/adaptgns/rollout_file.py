@@ -263,7 +263,9 @@ class RolloutFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         if path.is_dir():
-            held = ", ".join(str(file) for file in sorted(path.rglob("*.h5"))[:3])
+            held = ", ".join(
+                str(file) for file in sorted([*path.glob("*.h5"), *path.glob("*/*.h5")])[:3]
+            )
             raise RolloutFileError(
                 f"rollout file {path}: is a folder; a file is accepted"
                 + (f", such as {held}" if held else "")

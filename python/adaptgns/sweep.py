@@ -112,6 +112,7 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
     config = replace(config, radius=config.radius or (simulator.radius,))
     space = {"tau": config.tau, "factor": config.factor, "radius": config.radius}
     config.out.mkdir(parents=True, exist_ok=True)
+    # What stops a trial is told by whoever catches it, and Ctrl-C is no error of a trial.
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
     study = optuna.create_study(
         study_name="adaptgns",

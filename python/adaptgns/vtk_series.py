@@ -33,13 +33,13 @@ def write_series(file: RolloutFile, rollout: Rollout, folder: Path, every: int =
     """Write the series of ``rollout`` of ``file`` into ``folder``, every ``every``-th frame and the
     last. The indices, ``truth.pvd`` and the like, are written when all their frames are there.
 
-    ValueError for ``every`` below 1, a folder that holds frames already, and a prediction that is
+    ValueError for ``every`` below 1, a folder that holds series already, and a prediction that is
     not finite; ImportError without meshio.
     """
     if every < 1:
         raise ValueError(f"every: got {every}; accepted is 1 or more")
-    if any(folder.glob("*/*.vtu")):
-        raise ValueError(f"{folder}: holds frames already; remove it or name another")
+    if any((folder / f"{name}.pvd").exists() for name in SERIES):
+        raise ValueError(f"{folder}: holds series already; remove it or name another")
     meshio = _meshio()
     frames = Frames(file, rollout)
     shown = sorted({*range(0, rollout.steps + 1, every), rollout.steps})

@@ -259,19 +259,21 @@ def test_wrong_options_are_told_plainly(capsys: pytest.CaptureFixture[str]) -> N
     assert "steps: got 0; accepted are whole numbers >= 1" in capsys.readouterr().err
 
 
-def test_data_must_suit_the_model(metadata: Metadata) -> None:
-    where = Path("elsewhere")
-    assert metadata.check_suits(metadata, where) == []
+def test_data_must_suit_the_model(drops: Path, tmp_path: Path) -> None:
+    metadata = read_metadata(drops)
+    assert metadata.check_suits(drops) == []
     for change, told in (
-        ({"periodic": (True, False)}, "elsewhere: periodic is (True, False); the model was"),
-        ({"material_properties": 1}, "material_properties is 1; the model was trained with 0"),
+        ({"periodic": (True, False)}, "periodic is (False, False); the model was"),
+        ({"material_properties": 1}, "material_properties is 0; the model was trained with 1"),
     ):
         with pytest.raises(DataError, match=re.escape(told)):
-            metadata.check_suits(replace(metadata, **change), where)
-    slower = replace(metadata, dt=0.01, velocity_std=(1.0, 1.0))
-    assert metadata.check_suits(slower, where) == [
-        "elsewhere: dt is 0.01; the model goes by 0.0025, with which it was trained"
+            replace(metadata, **change).check_suits(drops)
+    faster = replace(metadata, dt=0.01, velocity_std=(1.0, 1.0))
+    assert faster.check_suits(drops) == [
+        f"{drops}: dt is {metadata.dt}; the model goes by 0.01, with which it was trained"
     ]
+    (note,) = metadata.check_suits(tmp_path)
+    assert "there is no metadata.json" in note
 
 
 def test_what_the_model_takes_otherwise_is_told(
@@ -281,11 +283,13 @@ def test_what_the_model_takes_otherwise_is_told(
     other = tmp_path / "other"
     other.mkdir()
     (other / "test.h5").write_bytes((drops / "test.h5").read_bytes())
-    write_metadata(other, content | {"default_connectivity_radius": 0.02})
+    kept = {name: value for name, value in content.items() if not name.endswith(("_mean", "_std"))}
+    write_metadata(other, kept | {"default_connectivity_radius": 0.02})
     options = ["--checkpoint", "waterdrop", "--data", str(other), "--trajectories", "1"]
     main([*options, "--steps", "2", "--out", str(tmp_path / "r.h5")])
     assert "note: " in (out := capsys.readouterr().out)
     assert "radius is 0.02; the model goes by 0.015" in out
+    assert "vel_std" not in json.loads((other / "metadata.json").read_text())
     write_metadata(other, content | {"periodic_boundary_conditions": [True, False]})
     with pytest.raises(SystemExit):
         main([*options, "--out", str(tmp_path / "s.h5")])

@@ -152,7 +152,7 @@ def test_what_is_refused(
     main(["vtk", str(adaptive), "--out", str(old), "--every", "10"])
     with pytest.raises(SystemExit):
         main(["vtk", str(adaptive), "--out", str(old)])
-    assert "old: holds frames already; remove it or name another" in capsys.readouterr().err
+    assert "old: holds series already; remove it or name another" in capsys.readouterr().err
     with h5py.File(adaptive, "r+") as file:
         file["00000/predicted"][6:, 0] = np.nan
     assert "positions that are not finite from step 7 on" in told()

@@ -94,12 +94,14 @@ def generate_dataset(
     if "train" not in plans:
         raise DataError(f"splits are {', '.join(plans)}; train is needed, for the statistics")
     folder = Path(folder)
+    made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     try:
         _generate(folder, plans, console)
     finally:
-        with suppress(OSError):
-            folder.rmdir()  # where nothing came of it
+        if made:
+            with suppress(OSError):
+                folder.rmdir()  # where nothing came of it, it is empty
 
 
 def _generate(folder: Path, plans: Mapping[str, SplitPlan], console: Console) -> None:

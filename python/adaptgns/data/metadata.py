@@ -65,31 +65,33 @@ class Metadata:
         """Which particles of these types `[N]` are not kinematic, bool `[N]`."""
         return ~np.isin(particle_type, self.kinematic_types)
 
-    def check_suits(self, data: Metadata, source: Path) -> list[str]:
-        """What a user should know who gives a model that was trained on this the `data` in
-        `source`: in what they differ.
+    def check_suits(self, folder: Path) -> list[str]:
+        """What a user should know who gives a model that was trained on this the data in `folder`:
+        in what they differ, statistics of motion apart, which a rollout doesn't need.
 
         Raises:
-            DataError: they differ in what a model can't do without.
+            DataError: they differ in what a model can't do without, or `metadata.json` is wrong.
         """
-        different = {
-            field.name: (getattr(self, field.name), getattr(data, field.name))
-            for field in fields(self)
-            if getattr(self, field.name) != getattr(data, field.name)
-        }
-        for name in ("dim", "periodic", "material_properties"):
-            if name in different:
-                trained, given = different[name]
+        if not (folder / FILE_NAME).exists():
+            return [
+                f"{folder}: there is no {FILE_NAME} that tells whether the model suits the data"
+            ]
+        section = training_section(_load(folder / FILE_NAME))
+        notes = []
+        for name, given in _setting(section, folder).items():
+            trained = getattr(self, name)
+            if given == trained:
+                continue
+            if name in {"dim", "periodic", "material_properties"}:
                 raise DataError(
-                    f"{source}: {name} is {given}; the model was trained with {trained} and "
+                    f"{folder}: {name} is {given}; the model was trained with {trained} and "
                     "accepts no other"
                 )
-        return [
-            f"{source}: {name} is {different[name][1]}; the model goes by {different[name][0]}, "
-            "with which it was trained"
-            for name in ("dt", "bounds", "radius", "kinematic_types")
-            if name in different
-        ]
+            notes.append(
+                f"{folder}: {name} is {given}; the model goes by {trained}, with which it was "
+                "trained"
+            )
+        return notes
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that `from_json` reads back exactly."""
@@ -122,7 +124,7 @@ def read_metadata(folder: Path) -> Metadata:
     folder = Path(folder)
     path = folder / FILE_NAME
     content = _load(path)
-    section = content["train"] if isinstance(content.get("train"), dict) else content
+    section = training_section(content)
     try:
         metadata = _parse(section, folder)
     except DataError as error:
@@ -164,7 +166,13 @@ def _load(path: Path) -> dict[str, Any]:
     return content
 
 
-def _parse(section: dict[str, Any], folder: Path) -> Metadata:
+def training_section(content: dict[str, Any]) -> dict[str, Any]:
+    """What describes the training data: geoelements/gns may have a section for it."""
+    return content["train"] if isinstance(content.get("train"), dict) else content
+
+
+def _setting(section: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """All of `Metadata` but the statistics of motion."""
     dim = _integer(section, "dim")
     bounds = tuple(_pair(axis) for axis in _list(section, "bounds"))
     periodic = _periodic(section, dim)
@@ -174,22 +182,34 @@ def _parse(section: dict[str, Any], folder: Path) -> Metadata:
     )
     radius = _number(section, "default_connectivity_radius")
     _check_geometry(dim, dt, bounds, periodic, radius)
-    kinematic = _kinematic_types(section)
-    statistics = {
+    return {
+        "dim": dim,
+        "dt": dt,
+        "bounds": bounds,
+        "periodic": periodic,
+        "radius": radius,
+        "kinematic_types": _kinematic_types(section),
+        "material_properties": _material_properties(section, folder),
+    }
+
+
+def _parse(section: dict[str, Any], folder: Path) -> Metadata:
+    setting = _setting(section, folder)
+    stated: dict[str, Any] = {
         ours: tuple(_list(section, key)) for ours, key in FILE_KEYS.items() if key in section
     }
-    if len(statistics) < len(FILE_KEYS):
-        statistics = asdict(_compute(folder, bounds, periodic, kinematic)) | statistics
-    return Metadata(
-        dim=dim,
-        dt=dt,
-        bounds=bounds,
-        periodic=periodic,
-        radius=radius,
-        kinematic_types=kinematic,
-        material_properties=_material_properties(section, folder),
-        **statistics,
+    if len(stated) == len(FILE_KEYS):
+        return Metadata(**setting, **stated)
+    computed = asdict(
+        _compute(folder, setting["bounds"], setting["periodic"], setting["kinematic_types"])
     )
+    for ours in ("velocity_std", "acceleration_std"):
+        if ours not in stated and not all(value > 0 for value in computed[ours]):
+            raise DataError(
+                f"{FILE_KEYS[ours]} of the train split is {list(computed[ours])}; numbers above 0 "
+                "are accepted: from motion that never changes nothing can be learned"
+            )
+    return Metadata(**setting, **(computed | stated))
 
 
 def _compute(
@@ -202,17 +222,9 @@ def _compute(
         train = open_split(folder, "train")
     except DataError as error:
         raise DataError(f"no motion statistics, and none can be computed: {error}") from error
-    statistics = compute_statistics(
+    return compute_statistics(
         train, box=period_lengths(bounds, periodic), kinematic_types=kinematic
     )
-    for ours in ("velocity_std", "acceleration_std"):
-        deviations = getattr(statistics, ours)
-        if not all(value > 0 for value in deviations):
-            raise DataError(
-                f"{FILE_KEYS[ours]} of the train split is {list(deviations)}; numbers above 0 are "
-                "accepted: from motion that never changes nothing can be learned"
-            )
-    return statistics
 
 
 def _write_back(path: Path, content: dict[str, Any], metadata: Metadata) -> None:

@@ -10,8 +10,10 @@ mod network;
 use mimalloc::MiMalloc;
 use pyo3::prelude::*;
 
-/// Keeps what is freed for a while: from step to step of a rollout the same memory is asked for,
-/// and the usual allocator gives that back to the system each time, to get it again page by page.
+/// Keeps what is freed until something else is asked for, later than a moment: from step to step of
+/// a rollout the same memory is asked for, and the usual allocator gives that back to the system each
+/// time, to get it again page by page. It holds a lock only while a thread starts or it gets more
+/// from the system; a child that is forked in that very moment, by another thread, would wait for it.
 #[global_allocator]
 static ALLOCATOR: MiMalloc = MiMalloc;
 

@@ -5,7 +5,7 @@ use std::mem::MaybeUninit;
 use super::Graph;
 use super::lanes::{LONGEST, Lanes, Work, widest};
 use super::memory::{Budget, filled, reserve};
-use super::order::{NONE, write_sorted};
+use super::order::{NONE, SHORT, write_sorted};
 use crate::Error;
 use crate::threads::Team;
 
@@ -150,7 +150,7 @@ impl Work for Writing<'_> {
         let mut at = 0;
         for (k, row) in self.rows.iter().enumerate() {
             if let Some(soon) = self.rows.get(k + SOON) {
-                for place in (0..count(k + SOON) + LINE).step_by(LINE) {
+                for place in (0..count(k + SOON).min(SHORT) + LINE).step_by(LINE) {
                     lanes.prefetch(soon.as_ptr().wrapping_add(place));
                 }
             }

@@ -47,6 +47,7 @@ pub(super) trait Work {
 }
 
 /// What a processor may have, from the least on.
+#[cfg(any(test, target_arch = "x86_64"))]
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub(super) enum Kind {
     Portable,
@@ -61,6 +62,7 @@ thread_local! {
 }
 
 /// The best that this processor has.
+#[cfg(any(test, target_arch = "x86_64"))]
 fn kind() -> Kind {
     #[cfg(target_arch = "x86_64")]
     let has = if is_x86_feature_detected!("avx512f")
@@ -136,7 +138,7 @@ impl Lanes<SHORTER> for Portable {
         end: *mut [i32; SHORTER],
     ) -> usize {
         const OFTEN: usize = SHORTER / 2;
-        let (places, count) = &ONES[usize::from(chosen)];
+        let (places, count) = &ONES[usize::from(chosen as u8)];
         let count = usize::from(*count);
         // SAFETY: promised by the caller.
         let end = unsafe { &mut *end };

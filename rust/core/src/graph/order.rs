@@ -45,7 +45,8 @@ fn write_sorted_long(row: &[i32], dropped: i32, out: &mut [MaybeUninit<i64>]) {
 /// comparisons go to an instruction, and no branch depends on their outcome.
 ///
 /// # Safety
-/// As there.
+/// The senders are distinct, `row` goes on for a block behind them, and in `out` there is room for
+/// whole blocks of them.
 #[inline(always)]
 pub(super) unsafe fn write_ranked<const BLOCK: usize>(
     row: &[i32],

@@ -142,12 +142,16 @@ mod tests {
         }
         let axes = [0.819_172_513_4, 0.671_043_606_7, 0.549_700_477_9].map(weyl::<T>);
         let periodic = [1.0, 0.0];
-        for (dim, r, period) in [
-            (2, 0.06, None),
-            (2, 0.06, Some(&periodic[..])),
-            (3, 0.15, None),
-        ] {
-            let positions: Vec<T> = (0..COUNT)
+        let mut edges = 0;
+        // One cell to sixteen along the period, and groups of one cell to four.
+        let radii = [0.06, 0.13, 0.15, 0.18, 0.22, 0.28, 0.35, 0.6];
+        let boxes = radii.map(|r| [(2, r, None), (2, r, Some(&periodic[..])), (3, r, None)]);
+        for ((dim, r, period), count) in boxes
+            .into_iter()
+            .flatten()
+            .flat_map(|case| [(case, COUNT / 15), (case, COUNT)])
+        {
+            let positions: Vec<T> = (0..count)
                 .flat_map(|i| axes[..dim].iter().map(move |axis| axis(i)))
                 .collect();
             let particles = Particles {
@@ -156,7 +160,7 @@ mod tests {
                 ptr: None,
                 period,
             };
-            let radii: Vec<f64> = (0..COUNT)
+            let radii: Vec<f64> = (0..count)
                 .map(|i| r * (0.5 + weyl::<f64>(0.754_877_666_2)(i)))
                 .collect();
             for self_edges in [false, true] {
@@ -170,7 +174,7 @@ mod tests {
                         .map(|radius| radius_graph(&particles, radius, &options).expect("room"))
                 };
                 let graphs = build(Kind::Portable);
-                assert!(graphs.iter().all(|graph| graph.senders().len() > 4 * COUNT));
+                edges += graphs[0].senders().len();
                 for kind in [Kind::Avx2, Kind::Avx512] {
                     assert_eq!(
                         graphs,
@@ -180,5 +184,6 @@ mod tests {
                 }
             }
         }
+        assert!(edges > 500 * COUNT);
     }
 }

@@ -60,10 +60,10 @@ pub trait Scalar:
     #[cfg(target_arch = "x86_64")]
     #[doc(hidden)]
     unsafe fn at_most_avx2(values: &[Self; SHORTER], limits: &[Self; SHORTER]) -> u16;
-    /// The same.
+    /// One bit per place, as [`Self::at_most_avx2`].
     ///
     /// # Safety
-    /// The processor has AVX-512.
+    /// The processor has AVX-512 F.
     #[cfg(target_arch = "x86_64")]
     #[doc(hidden)]
     unsafe fn at_most_avx512(values: &[Self; LONGEST], limits: &[Self; LONGEST]) -> u16;

@@ -27,7 +27,7 @@ impl Lanes<BLOCK> for Avx2 {
 
     #[inline(always)]
     unsafe fn append(self, chosen: u16, values: &[i32; BLOCK], end: *mut [i32; BLOCK]) -> usize {
-        let (places, count) = &ONES[usize::from(chosen)];
+        let (places, count) = &ONES[usize::from(chosen as u8)];
         // SAFETY: the processor has AVX2, the loads are of blocks, and the caller promised that
         // there is room for one.
         unsafe {
