@@ -56,12 +56,14 @@ def write(study: Study) -> list[Path]:
 
 
 def write_into(study: Study, readme: Path) -> None:
-    """Replace what lies between the two marks in ``readme`` by the tables of the rollouts."""
+    """Replace what lies between the two marks in ``readme`` by the tables of the rollouts, of the
+    models that were trained in full."""
     text = readme.read_text("utf-8")
     start, end = (text.find(marker) for marker in MARKERS)
     if start < 0 or end < start:
         raise ValueError(f"{readme}: holds no {MARKERS[0]} followed by {MARKERS[1]}")
     parts = [_made(study)]
+    partial = {model.title for model in study.profile.models if model.share < 1}
     for table in tables(Results(study)):
         if table.name.startswith("rollouts"):
             kept = [
@@ -70,7 +72,11 @@ def write_into(study: Study, readme: Path) -> None:
                 *range(2, 3 + len(study.profile.marks)),
                 -3,
             ]  # the columns that say it; the report has them all
-            rows = [Row([row.cells[i] for i in kept]) for row in table.rows]
+            rows = [
+                Row([row.cells[i] for i in kept])
+                for row in table.rows
+                if row.cells[0] not in partial
+            ]
             short = Table(table.name, table.title, [table.columns[i] for i in kept], rows)
             parts.append(f"**{table.title}**\n\n{_table(short)}")
     inside = "\n\n".join(parts)
