@@ -118,12 +118,8 @@ pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
         .and_then(|helpers| Some((helpers, helpers.pool.as_ref()?)))
         .filter(|(helpers, _)| !helpers.taken.swap(true, Ordering::Relaxed));
     let team = Team {
-        work: UnsafeCell::new(None),
-        open: AtomicUsize::new(0),
-        active: AtomicUsize::new(0),
-        count: Cell::new(0),
-        over: AtomicBool::new(false),
         helped: helpers.is_some(),
+        ..Team::alone()
     };
     let Some((helpers, pool)) = helpers else {
         return body(&team);
@@ -175,6 +171,18 @@ impl Helped<'_> {
 }
 
 impl Team {
+    /// The calling thread.
+    pub fn alone() -> Self {
+        Self {
+            work: UnsafeCell::new(None),
+            open: AtomicUsize::new(0),
+            active: AtomicUsize::new(0),
+            count: Cell::new(0),
+            over: AtomicBool::new(false),
+            helped: false,
+        }
+    }
+
     /// `task` of every item, in the order of the items, computed by the whole team.
     pub fn map<I: Send, R: Send>(&self, items: Vec<I>, task: impl Fn(I) -> R + Sync) -> Vec<R> {
         if !self.helped || items.len() < 2 {

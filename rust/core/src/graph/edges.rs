@@ -4,7 +4,7 @@ use std::mem::MaybeUninit;
 
 use super::Graph;
 use super::lanes::{LONGEST, Lanes, Work, widest};
-use super::memory::{Budget, filled, reserve};
+use super::memory::{Budget, Places, reserve, room};
 use super::order::{NONE, SHORT, write_sorted};
 use crate::Error;
 use crate::threads::Team;
@@ -77,54 +77,66 @@ const LINE: usize = 16;
 const TASK: usize = 4096;
 
 /// Puts `parts`, each the rows of the receivers named, into one edge list over
-/// `particles`, sorted by receiver. Every particle is named once.
-pub(super) fn assemble(
+/// `particles`, sorted by receiver.
+///
+/// # Safety
+/// The parts name every particle once.
+pub(super) unsafe fn assemble(
     particles: usize,
-    parts: &[(&[i32], &Rows)],
+    parts: Vec<(&[i32], &Rows)>,
     drop_self: bool,
     team: &Team,
     budget: &Budget,
 ) -> Result<Graph, Error> {
-    // First how many edges each receiver has, behind its place, then their sums.
-    let mut offsets = filled(0_i64, particles + 1);
-    let mut rows: Vec<&[i32]> = filled(&[][..], particles);
-    for (receivers, part) in parts {
+    // The senders of each receiver, and the room behind them.
+    let mut rows: Vec<&[i32]> = room(particles);
+    let places = Places::of(&mut rows.spare_capacity_mut()[..particles]);
+    team.map(parts, |(receivers, part)| {
         let mut senders = &part.senders[..];
         for (&receiver, &count) in receivers.iter().zip(&part.counts) {
-            // A row has room behind it, which lets whole blocks be read.
-            offsets[receiver as usize + 1] = i64::from(count) - i64::from(drop_self);
-            rows[receiver as usize] = senders;
-            senders = &senders[count as usize..];
+            let count = count as usize;
+            // SAFETY: nobody else writes the row of this receiver.
+            unsafe { places.write(receiver as usize, &senders[..count + ROOM]) };
+            senders = &senders[count..];
         }
-    }
-    let mut total = 0;
-    for offset in &mut offsets {
-        total += *offset;
-        *offset = total;
-    }
+    });
+    // SAFETY: every particle is named.
+    unsafe { rows.set_len(particles) };
 
-    let edges = total as usize;
+    let kept = |row: &&[i32]| row.len() - ROOM - usize::from(drop_self);
+    let counts = team.map(rows.chunks(TASK).collect(), |rows| {
+        rows.iter().map(kept).sum::<usize>()
+    });
+    let edges = counts.iter().sum();
     budget.check(edges)?;
     let mut edge_index: Vec<i64> = reserve(2 * edges).ok_or_else(|| no_memory_for(edges))?;
+    let mut offsets: Vec<i64> = room(particles + 1);
     let (mut senders, mut receivers) =
         edge_index.spare_capacity_mut()[..2 * edges].split_at_mut(edges);
-    let mut tasks = Vec::new();
-    for (t, rows) in rows.chunks(TASK).enumerate() {
-        let first = t * TASK;
-        let offsets = &offsets[first..=first + rows.len()];
-        let edges = (offsets[rows.len()] - offsets[0]) as usize;
-        tasks.push(Writing {
-            first: first as i32,
-            rows,
-            offsets,
-            drop_self,
-            senders: senders.split_off_mut(..edges).expect("edges left"),
-            receivers: receivers.split_off_mut(..edges).expect("edges left"),
+    let mut first_edge = 0;
+    let tasks = rows
+        .chunks(TASK)
+        .zip(offsets.spare_capacity_mut().chunks_mut(TASK))
+        .zip(counts)
+        .enumerate()
+        .map(|(t, ((rows, offsets), count))| {
+            first_edge += count;
+            Writing {
+                first: (t * TASK) as i32,
+                first_edge: first_edge - count,
+                rows,
+                offsets,
+                drop_self,
+                senders: senders.split_off_mut(..count).expect("edges left"),
+                receivers: receivers.split_off_mut(..count).expect("edges left"),
+            }
         });
-    }
-    team.map(tasks, widest);
+    team.map(tasks.collect(), widest);
     // SAFETY: the tasks' rows partition both halves, and each wrote all of its part.
     unsafe { edge_index.set_len(2 * edges) };
+    // SAFETY: as above, and the last one is written here.
+    unsafe { offsets.set_len(particles) };
+    offsets.push(edges as i64);
     Ok(Graph {
         edge_index,
         offsets,
@@ -134,8 +146,10 @@ pub(super) fn assemble(
 /// The rows of some receivers, and their place in the edge list.
 struct Writing<'a> {
     first: i32,
+    first_edge: usize,
     rows: &'a [&'a [i32]],
-    offsets: &'a [i64],
+    /// As many, or one more.
+    offsets: &'a mut [MaybeUninit<i64>],
     drop_self: bool,
     senders: &'a mut [MaybeUninit<i64>],
     receivers: &'a mut [MaybeUninit<i64>],
@@ -146,18 +160,18 @@ impl Work for Writing<'_> {
 
     #[inline(always)]
     fn run<const BLOCK: usize, L: Lanes<BLOCK>>(self, lanes: L) {
-        let count = |k: usize| (self.offsets[k + 1] - self.offsets[k]) as usize;
         let mut at = 0;
-        for (k, row) in self.rows.iter().enumerate() {
+        for (k, (row, offset)) in self.rows.iter().zip(self.offsets).enumerate() {
             if let Some(soon) = self.rows.get(k + SOON) {
-                for place in (0..count(k + SOON).min(SHORT) + LINE).step_by(LINE) {
+                for place in (0..soon.len().min(SHORT + ROOM)).step_by(LINE) {
                     lanes.prefetch(soon.as_ptr().wrapping_add(place));
                 }
             }
+            offset.write((self.first_edge + at) as i64);
             let receiver = self.first + k as i32;
-            let count = count(k);
+            let found = row.len() - ROOM;
+            let count = found - usize::from(self.drop_self);
             let dropped = if self.drop_self { receiver } else { NONE };
-            let found = count + usize::from(self.drop_self);
             // SAFETY: a search finds every sender once, the receiver among them.
             unsafe { write_sorted(lanes, row, found, dropped, &mut self.senders[at..]) };
             fill(&mut self.receivers[at..], count, i64::from(receiver));

@@ -9,7 +9,10 @@
 use std::ops::Range;
 
 use super::lanes::LONGEST;
+use super::memory::{SHARE, collected};
 use super::scalar::Scalar;
+use super::sort::sort_by_cell;
+use crate::threads::Team;
 
 /// Particles that are worth the care for a group of cells: that takes longer than the search
 /// among a few candidates more.
@@ -124,89 +127,80 @@ impl Axis {
     }
 }
 
+/// How many cells are walked through together for so many particles.
+fn together<const D: usize>(axes: &[Axis; D], particles: usize) -> u64 {
+    let cells: f64 = axes.iter().map(|axis| axis.count as f64).product();
+    let together = (WORTH * cells / particles as f64).ceil();
+    together.clamp(1.0, MOST_TOGETHER) as u64
+}
+
 impl<T: Scalar, const D: usize> Grid<T, D> {
     /// Sorts `positions` for searches up to `cutoff`; their caller's indices begin at
     /// `first`. Within a cell particles keep their order.
-    pub fn new(positions: &[[T; D]], first: usize, period: &[T; D], cutoff: f64) -> Self {
+    pub fn new(
+        positions: &[[T; D]],
+        first: usize,
+        period: &[T; D],
+        cutoff: f64,
+        team: &Team,
+    ) -> Self {
         if period.iter().any(|length| length.is_finite()) {
-            let wrapped: Vec<_> = positions.iter().map(|p| wrap(p, period)).collect();
-            Self::from_wrapped(&wrapped, first, period, cutoff)
+            let wrapped = collected(team, positions.len(), |i| wrap(&positions[i], period));
+            Self::from_wrapped(&wrapped, first, period, cutoff, team)
         } else {
-            Self::from_wrapped(positions, first, period, cutoff)
+            Self::from_wrapped(positions, first, period, cutoff, team)
         }
     }
 
-    fn from_wrapped(positions: &[[T; D]], first: usize, period: &[T; D], cutoff: f64) -> Self {
-        let (low, high) = bounds(positions);
-        let most = MOST_CELLS_PER_PARTICLE * positions.len() + 1024;
+    fn from_wrapped(
+        positions: &[[T; D]],
+        first: usize,
+        period: &[T; D],
+        cutoff: f64,
+        team: &Team,
+    ) -> Self {
+        let shares = team.map(positions.chunks(SHARE).collect(), bounds);
+        let (low, high) = shares
+            .into_iter()
+            .reduce(|(low, high), (lower, higher)| {
+                (
+                    std::array::from_fn(|a| low[a].min(lower[a])),
+                    std::array::from_fn(|a| high[a].max(higher[a])),
+                )
+            })
+            .unwrap_or(([0.0; D], [0.0; D]));
+        let most = (MOST_CELLS_PER_PARTICLE * positions.len() + 1024).min(u32::MAX as usize);
         let axes: [Axis; D] =
             std::array::from_fn(|a| Axis::new(low[a], high[a], period[a], cutoff));
         let cells = axes.iter().map(|axis| axis.count as f64).product::<f64>();
         if cells <= most as f64 {
-            Self::dense(positions, first, axes, cells as usize)
+            Self::dense(positions, first, axes, cells as usize, team)
         } else {
             Self::sparse(positions, first, axes)
         }
     }
 
-    /// A stable counting sort by cell number.
-    fn dense(positions: &[[T; D]], first: usize, axes: [Axis; D], cells: usize) -> Self {
-        let mut starts = vec![0_u32; cells + 1];
-        let cell_of: Vec<u32> = positions
-            .iter()
-            .map(|p| {
-                let cell = (0..D).rev().fold(0, |row, a| {
-                    row * axes[a].count as u32 + axes[a].cell(p[a]) as u32
-                });
-                starts[cell as usize] += 1;
-                cell
-            })
-            .collect();
-        // From counts to ends; the sort below, from the last particle to the first,
-        // moves each end back to its start.
-        let mut total = 0;
-        for start in &mut starts {
-            total += *start;
-            *start = total;
-        }
-        let mut order = vec![0_u32; positions.len()];
-        for (i, &cell) in cell_of.iter().enumerate().rev() {
-            starts[cell as usize] -= 1;
-            order[starts[cell as usize] as usize] = i as u32;
-        }
-        Self::sorted(
-            positions,
-            first,
-            order.into_iter(),
-            axes,
-            Rows::Dense { starts },
-        )
-    }
-
-    fn sorted(
+    fn dense(
         positions: &[[T; D]],
         first: usize,
-        order: impl Iterator<Item = u32> + Clone,
         axes: [Axis; D],
-        rows: Rows<D>,
+        cells: usize,
+        team: &Team,
     ) -> Self {
-        let cells = axes.iter().map(|axis| axis.count as f64).product::<f64>();
-        let together = (WORTH * cells / positions.len() as f64).ceil();
+        let cell = |p: &[T; D]| {
+            (0..D).rev().fold(0, |row, a| {
+                row * axes[a].count as u32 + axes[a].cell(p[a]) as u32
+            })
+        };
+        let sorted = sort_by_cell(positions, first, cells, cell, team);
         Self {
+            together: together(&axes, positions.len()),
             axes,
-            rows,
-            together: together.clamp(1.0, MOST_TOGETHER) as u64,
-            coords: std::array::from_fn(|a| {
-                order
-                    .clone()
-                    .map(|i| positions[i as usize][a])
-                    .chain([T::default(); LONGEST])
-                    .collect()
-            }),
-            index: order
-                .map(|i| first as i32 + i as i32)
-                .chain([0; LONGEST])
-                .collect(),
+            rows: Rows::Dense {
+                starts: sorted.starts,
+            },
+            coords: sorted.coords,
+            index: sorted.index,
         }
     }
 
@@ -233,8 +227,20 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
         }
         starts.push(order.len() as u32);
         let x = order.iter().map(|(key, _)| key[D - 1]).collect();
-        let rows = Rows::Sparse { keys, starts, x };
-        Self::sorted(positions, first, order.iter().map(|&(_, i)| i), axes, rows)
+        Self {
+            together: together(&axes, positions.len()),
+            axes,
+            rows: Rows::Sparse { keys, starts, x },
+            coords: std::array::from_fn(|a| {
+                let sorted = order.iter().map(|&(_, i)| positions[i as usize][a]);
+                sorted.chain([T::default(); LONGEST]).collect()
+            }),
+            index: order
+                .iter()
+                .map(|&(_, i)| (first + i as usize) as i32)
+                .chain([0; LONGEST])
+                .collect(),
+        }
     }
 
     /// The caller's indices of the sorted particles.

@@ -80,7 +80,8 @@ fn build<T: Nearest, const D: usize>(
             .map(|(search, locations)| search.members_of(locations.clone()))
             .zip(&found)
             .collect();
-        edges::assemble(count, &parts, false, team, &budget)
+        // SAFETY: the graphs partition the particles, and a search has each of its own once.
+        unsafe { edges::assemble(count, parts, false, team, &budget) }
     })
 }
 

@@ -26,6 +26,7 @@ mod order;
 mod radius;
 mod scalar;
 mod search;
+mod sort;
 
 pub use adaptive::{Expansion, adaptive_graph};
 pub use input::{Options, Particles};

@@ -9,7 +9,7 @@ use super::memory::Budget;
 use super::scalar::Scalar;
 use super::search::{Cutoff, Search};
 use crate::Error;
-use crate::threads;
+use crate::threads::{self, Team};
 
 /// How far particles see.
 #[derive(Debug, Clone, Copy)]
@@ -93,12 +93,13 @@ fn build<T: Scalar, const D: usize>(
     // The others wake while the particles are sorted.
     threads::team(options.threads.at_most(tasks), |team| {
         let budget = Budget::default();
-        let searches = team
-            .map(batch.graphs.clone(), |graph| {
-                Search::new(batch, graph, cutoff, &budget)
-            })
-            .into_iter()
-            .collect::<Result<Vec<_>, _>>()?;
+        let searches = match &batch.graphs[..] {
+            [graph] => vec![Search::new(batch, graph.clone(), cutoff, team, &budget)],
+            graphs => team.map(graphs.to_vec(), |graph| {
+                Search::new(batch, graph, cutoff, &Team::alone(), &budget)
+            }),
+        };
+        let searches = searches.into_iter().collect::<Result<Vec<_>, _>>()?;
         let tasks: Vec<(&Search<T, D>, Range<usize>)> = searches
             .iter()
             .flat_map(|search| {
@@ -117,7 +118,8 @@ fn build<T: Scalar, const D: usize>(
             .map(|(search, slots)| &search.index()[slots.clone()])
             .zip(&found)
             .collect();
-        edges::assemble(count, &parts, !options.self_edges, team, &budget)
+        // SAFETY: the graphs partition the particles, and a search has each of its own once.
+        unsafe { edges::assemble(count, parts, !options.self_edges, team, &budget) }
     })
 }
 

@@ -10,9 +10,10 @@ use super::edges::Rows;
 use super::grid::Grid;
 use super::input::Batch;
 use super::lanes::{LONGEST, Lanes, Work, widest};
-use super::memory::Budget;
+use super::memory::{Budget, collected};
 use super::scalar::Scalar;
 use crate::Error;
+use crate::threads::Team;
 
 /// A checked [`Radius`](super::Radius).
 #[derive(Clone, Copy)]
@@ -40,6 +41,7 @@ impl<T: Scalar, const D: usize> Search<T, D> {
         batch: &Batch<'_, T, D>,
         graph: Range<usize>,
         cutoff: Cutoff<'_, T>,
+        team: &Team,
         budget: &Budget,
     ) -> Result<Self, Error> {
         let (shortest, longest) = match cutoff {
@@ -55,16 +57,17 @@ impl<T: Scalar, const D: usize> Search<T, D> {
             graph.start,
             &batch.period,
             longest.to_f64(),
+            team,
         );
         budget.check(grid.pairs_at_least(shortest.to_f64()))?;
         let limits = match cutoff {
             Cutoff::Uniform(r) => Limits::Uniform(r * r),
             Cutoff::PerParticle(radii) => {
-                let squares = grid.index().iter().map(|&i| {
-                    let r = radii[i as usize];
+                let index = grid.index();
+                Limits::PerParticle(collected(team, index.len() + LONGEST, |slot| {
+                    let r = index.get(slot).map_or(T::default(), |&i| radii[i as usize]);
                     r * r
-                });
-                Limits::PerParticle(squares.chain([T::default(); LONGEST]).collect())
+                }))
             }
         };
         Ok(Self {
