@@ -17,7 +17,7 @@ const BYTES_PER_EDGE: usize = 2 * size_of::<i64>() + size_of::<i32>();
 const UNASKED: usize = 1 << 22;
 
 /// Values that one thread deals with at a time where all are alike.
-pub(super) const SHARE: usize = 1 << 14;
+pub(super) const SHARE: usize = 1 << 12;
 
 /// Counts the edges that all threads have found so far.
 #[derive(Default)]

@@ -34,7 +34,8 @@ pub fn radius_graph<T: Scalar, S: Scalar>(
     let count = particles.count()?;
     match radius {
         Radius::Uniform(r) => {
-            within_cutoff(particles, Cutoff::Uniform(check_radius("r", r)?), options)
+            let r = check_radius("r", r)?;
+            within_cutoff(particles, options, |_| Cutoff::Uniform(r))
         }
         Radius::PerParticle(radii) => {
             check_length("r", radii.len(), count)?;
@@ -42,7 +43,12 @@ pub fn radius_graph<T: Scalar, S: Scalar>(
                 .iter()
                 .map(|&r| check_radius("r", r.to_f64()))
                 .collect::<Result<Vec<T>, _>>()?;
-            within_cutoff(particles, Cutoff::PerParticle(&radii), options)
+            let cutoff = Cutoff::PerParticle {
+                shortest: radii.iter().copied().fold(T::INFINITY, T::lesser),
+                longest: radii.iter().copied().fold(T::default(), T::greater),
+                radii,
+            };
+            within_cutoff(particles, options, |_| cutoff)
         }
     }
 }
@@ -62,14 +68,15 @@ pub(super) fn check_radius<T: Scalar>(argument: &'static str, value: f64) -> Res
     ))
 }
 
+/// The graph of all pairs within a cutoff, which the threads find that build it.
 pub(super) fn within_cutoff<T: Scalar>(
     particles: &Particles<'_, T>,
-    cutoff: Cutoff<'_, T>,
     options: &Options,
+    cutoff: impl FnOnce(&Team) -> Cutoff<T>,
 ) -> Result<Graph, Error> {
     match particles.dim {
-        2 => build(&particles.check::<2>()?, cutoff, options),
-        _ => build(&particles.check::<3>()?, cutoff, options),
+        2 => build(&particles.check::<2>()?, options, cutoff),
+        _ => build(&particles.check::<3>()?, options, cutoff),
     }
 }
 
@@ -81,8 +88,8 @@ const SERIAL: usize = 6 * TASK;
 
 fn build<T: Scalar, const D: usize>(
     batch: &Batch<'_, T, D>,
-    cutoff: Cutoff<'_, T>,
     options: &Options,
+    cutoff: impl FnOnce(&Team) -> Cutoff<T>,
 ) -> Result<Graph, Error> {
     let count = batch.positions.len();
     let tasks = if count < SERIAL {
@@ -93,6 +100,7 @@ fn build<T: Scalar, const D: usize>(
     // The others wake while the particles are sorted.
     threads::team(options.threads.at_most(tasks), |team| {
         let budget = Budget::default();
+        let cutoff = &cutoff(team);
         let searches = match &batch.graphs[..] {
             [graph] => vec![Search::new(batch, graph.clone(), cutoff, team, &budget)],
             graphs => team.map(graphs.to_vec(), |graph| {

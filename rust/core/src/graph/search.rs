@@ -16,10 +16,13 @@ use crate::Error;
 use crate::threads::Team;
 
 /// A checked [`Radius`](super::Radius).
-#[derive(Clone, Copy)]
-pub(super) enum Cutoff<'a, T> {
+pub(super) enum Cutoff<T> {
     Uniform(T),
-    PerParticle(&'a [T]),
+    PerParticle {
+        radii: Vec<T>,
+        shortest: T,
+        longest: T,
+    },
 }
 
 /// One graph, sorted and ready to be searched.
@@ -40,18 +43,12 @@ impl<T: Scalar, const D: usize> Search<T, D> {
     pub fn new(
         batch: &Batch<'_, T, D>,
         graph: Range<usize>,
-        cutoff: Cutoff<'_, T>,
+        cutoff: &Cutoff<T>,
         team: &Team,
         budget: &Budget,
     ) -> Result<Self, Error> {
-        let (shortest, longest) = match cutoff {
-            Cutoff::Uniform(r) => (r, r),
-            Cutoff::PerParticle(radii) => radii[graph.clone()]
-                .iter()
-                .fold((T::INFINITY, T::default()), |(shortest, longest), &r| {
-                    (shortest.lesser(r), longest.greater(r))
-                }),
-        };
+        let &(Cutoff::Uniform(shortest) | Cutoff::PerParticle { shortest, .. }) = cutoff;
+        let &(Cutoff::Uniform(longest) | Cutoff::PerParticle { longest, .. }) = cutoff;
         let grid = Grid::new(
             &batch.positions[graph.clone()],
             graph.start,
@@ -61,8 +58,8 @@ impl<T: Scalar, const D: usize> Search<T, D> {
         );
         budget.check(grid.pairs_at_least(shortest.to_f64()))?;
         let limits = match cutoff {
-            Cutoff::Uniform(r) => Limits::Uniform(r * r),
-            Cutoff::PerParticle(radii) => {
+            &Cutoff::Uniform(r) => Limits::Uniform(r * r),
+            Cutoff::PerParticle { radii, .. } => {
                 let index = grid.index();
                 Limits::PerParticle(collected(team, index.len() + LONGEST, |slot| {
                     let r = index.get(slot).map_or(T::default(), |&i| radii[i as usize]);
