@@ -55,21 +55,24 @@ SIGMAS = ("random", "smooth")
 
 SLOW = 2.0
 """Seconds of a call above which it is timed once"""
+TURN = 40_000
+"""Particles that a builder deals with in its turn, in as many frames as that makes"""
 MOST = {"freud": 100_000, "torch_cluster": 100_000}
 """Particles beyond which a peer is left out: a minute and more"""
 
 
-def timed(builders: dict[str, Callable[[], Any]], seconds: float) -> dict[str, float]:
+def timed(frames: list[dict[str, Callable[[], Any]]], seconds: float) -> dict[str, float]:
     """Median milliseconds of each builder over rounds of all, for about ``seconds``.
 
-    Every timed call follows an untimed one of the same builder, as in a loop over steps: what the
-    builder before it left in the caches and of the system's memory is not its own cost.
+    In its turn a builder goes through all ``frames``, as in a rollout, after an untimed call: what
+    the builder before it left in the caches, of the system's memory and of threads that are still
+    awake is not its own cost, and no branch predictor learns particles by heart.
     """
-    times: dict[str, list[float]] = {name: [] for name in builders}
+    times: dict[str, list[float]] = {name: [] for name in frames[0]}
 
-    def call(name: str) -> float:
+    def call(builder: Callable[[], Any]) -> float:
         start = time.perf_counter()
-        builders[name]()
+        builder()
         return time.perf_counter() - start
 
     end = time.perf_counter() + seconds
@@ -79,8 +82,8 @@ def timed(builders: dict[str, Callable[[], Any]], seconds: float) -> dict[str, f
         for name, taken in times.items():
             if taken and taken[0] > SLOW:
                 continue
-            call(name)
-            taken.append(call(name))
+            call(frames[-1][name])
+            taken.extend(call(builders[name]) for builders in frames)
     return {name: 1e3 * statistics.median(values) for name, values in times.items()}
 
 
@@ -144,29 +147,36 @@ def measure(
     n: int, d: int, degree: float, kind: str, seconds: float, per_second: float
 ) -> dict[str, Any]:
     rng = np.random.default_rng(n + d)
-    pos = rng.random((n, d)).astype(kind)
     ball = math.pi if d == 2 else 4 / 3 * math.pi
     r = (degree / (n * ball)) ** (1 / d)
-    random = rng.random(n).astype(kind)
-    smooth = np.sin(2 * math.pi * pos).sum(axis=1) + d
+    frames = []
+    for _ in range(max(1, TURN // n)):
+        pos = rng.random((n, d)).astype(kind)
+        random = rng.random(n).astype(kind)
+        smooth = np.sin(2 * math.pi * pos).sum(axis=1) + d
+        frames.append((pos, random, smooth))
 
-    def adaptive(sigma: Any) -> Any:
-        return adaptive_graph(pos, sigma, r, TAU, FACTOR)
-
-    times = timed(
-        {
+    def builders(pos: Any, random: Any, smooth: Any) -> dict[str, Callable[[], Any]]:
+        return {
             **(peers(pos, r) if n <= LARGEST_OF_PEERS else {}),
             "base": lambda: radius_graph(pos, r),
             "base, one thread": lambda: radius_graph(pos, r, threads=1),
-            "adaptive, random sigma": lambda: adaptive(random),
-            "adaptive, smooth sigma": lambda: adaptive(smooth),
-        },
-        seconds,
-    )
-    edges = radius_graph(pos, r).shape[1]
+            "adaptive, random sigma": lambda: adaptive_graph(pos, random, r, TAU, FACTOR),
+            "adaptive, smooth sigma": lambda: adaptive_graph(pos, smooth, r, TAU, FACTOR),
+        }
 
-    def per_edge(name: str, sigma: Any) -> float:
-        return times[name] / adaptive(sigma).shape[1] / (times["base"] / edges)
+    every = [builders(*frame) for frame in frames]
+    times = timed(every, seconds)
+    edges, *adaptive = (
+        statistics.mean(builders[name]().shape[1] for builders in every)
+        for name in ("base", *(f"adaptive, {name} sigma" for name in SIGMAS))
+    )
+
+    def per_edge(name: str) -> float:
+        written = adaptive[SIGMAS.index(name)] / edges
+        return times[f"adaptive, {name} sigma"] / times["base"] / written
+
+    pos = frames[0][0]
 
     others = {name: times[name] for name in PEERS if name in times}
     moved = pos.nbytes + 2 * edges * np.dtype(np.int64).itemsize
@@ -184,8 +194,8 @@ def measure(
         "adaptive over base": {
             name: times[f"adaptive, {name} sigma"] / times["base"] for name in SIGMAS
         },
-        "adaptive over base per edge, random sigma": per_edge("adaptive, random sigma", random),
-        "adaptive over base per edge, smooth sigma": per_edge("adaptive, smooth sigma", smooth),
+        "adaptive over base per edge, random sigma": per_edge("random"),
+        "adaptive over base per edge, smooth sigma": per_edge("smooth"),
     }
 
 

@@ -7,6 +7,7 @@
 //! and a process with another id makes its own and leaks the old one.
 
 use std::cell::{Cell, UnsafeCell};
+use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
 use std::sync::atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -202,6 +203,51 @@ impl Team {
         let mut results = std::mem::take(&mut *lock(&finished));
         results.sort_unstable_by_key(|&(i, _)| i);
         results.into_iter().map(|(_, result)| result).collect()
+    }
+
+    /// All results of [`Self::map`] joined, in the order of the items: a result is joined as soon as
+    /// those before it are, so that few wait at a time.
+    pub fn reduce<I: Send, R: Send>(
+        &self,
+        items: Vec<I>,
+        task: impl Fn(I) -> R + Sync,
+        join: impl Fn(R, R) -> R + Sync,
+    ) -> Option<R> {
+        struct Joined<R> {
+            /// What is joined; whoever joins the next result to it has taken it.
+            total: Option<R>,
+            count: usize,
+            waiting: BTreeMap<usize, R>,
+        }
+        let joined = Mutex::new(Joined {
+            total: None,
+            count: 0,
+            waiting: BTreeMap::new(),
+        });
+        self.map(items.into_iter().enumerate().collect(), |(i, item)| {
+            let result = task(item);
+            lock(&joined).waiting.insert(i, result);
+            loop {
+                let mut now = lock(&joined);
+                let count = now.count;
+                if count > 0 && now.total.is_none() {
+                    break;
+                }
+                let Some(next) = now.waiting.remove(&count) else {
+                    break;
+                };
+                let total = now.total.take();
+                now.count += 1;
+                drop(now);
+                let total = match total {
+                    Some(total) => join(total, next),
+                    None => next,
+                };
+                lock(&joined).total = Some(total);
+            }
+        });
+        let joined = joined.into_inner();
+        joined.unwrap_or_else(PoisonError::into_inner).total
     }
 
     /// Does `work` on every thread of the team, which shares it out itself.

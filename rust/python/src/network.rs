@@ -219,13 +219,14 @@ fn network_forward<'py>(
     let arguments = Arguments::new(perceptrons, node_features, edges, heads, threads)?;
     let (network, features) = (arguments.network()?, arguments.features()?);
     let threads = arguments.threads;
+    let widths: Vec<usize> = network.heads.iter().map(Mlp::outputs).collect();
     let (outputs, tape) = py
         .detach(|| network.forward(features, keep, threads))
         .map_err(to_python)?;
-    let outputs = (outputs.into_iter().zip(&network.heads))
-        .map(|(flat, head)| {
-            let rows = flat.len() / head.outputs();
-            flat.into_pyarray(py).reshape([rows, head.outputs()])
+    let outputs = (outputs.into_iter().zip(widths))
+        .map(|(flat, width)| {
+            let rows = flat.len() / width;
+            flat.into_pyarray(py).reshape([rows, width])
         })
         .collect::<PyResult<_>>()?;
     Ok((outputs, tape.map(|tape| NetworkTape(tape.into()))))

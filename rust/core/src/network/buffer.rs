@@ -1,45 +1,91 @@
 //! Memory that goes from one step to the next, since fresh memory costs a page fault every 4 KiB.
+//!
+//! It comes from the system's allocator: what is the global one, which a Python module chooses for
+//! many small requests, may take half as much again for those of megabytes.
 
+use std::alloc::{GlobalAlloc, Layout, System, handle_alloc_error};
 use std::ops::{Deref, DerefMut};
+use std::ptr::NonNull;
+use std::slice;
 use std::sync::{Mutex, MutexGuard};
 
 /// The most numbers that wait for use (1 GiB); what goes beyond is freed.
 const MOST: usize = 1 << 28;
 
-static FREE: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
+static FREE: Mutex<Vec<Memory>> = Mutex::new(Vec::new());
 
 /// The list of what waits; `None` if it stays locked, as it would in a process that forked while
 /// another thread held it.
-fn free() -> Option<MutexGuard<'static, Vec<Vec<f32>>>> {
+fn free() -> Option<MutexGuard<'static, Vec<Memory>>> {
     (0..1_000).find_map(|_| {
         std::hint::spin_loop();
         FREE.try_lock().ok()
     })
 }
 
+/// Room for numbers, each of which has some value.
+struct Memory {
+    start: NonNull<f32>,
+    capacity: usize,
+}
+
+// SAFETY: it owns what it points to.
+unsafe impl Send for Memory {}
+// SAFETY: as above, and it changes only for who has it alone.
+unsafe impl Sync for Memory {}
+
+impl Memory {
+    fn new(capacity: usize) -> Self {
+        let layout = Self::layout(capacity);
+        let start = if capacity == 0 {
+            NonNull::dangling()
+        } else {
+            // SAFETY: the layout has bytes, and zeros are numbers.
+            let start = unsafe { System.alloc_zeroed(layout) };
+            NonNull::new(start.cast()).unwrap_or_else(|| handle_alloc_error(layout))
+        };
+        Self { start, capacity }
+    }
+
+    fn layout(capacity: usize) -> Layout {
+        Layout::array::<f32>(capacity).expect("memory that can be addressed")
+    }
+}
+
+impl Drop for Memory {
+    fn drop(&mut self) {
+        if self.capacity > 0 {
+            // SAFETY: it was allocated so.
+            unsafe { System.dealloc(self.start.as_ptr().cast(), Self::layout(self.capacity)) };
+        }
+    }
+}
+
 /// Numbers whose memory is used again once they are dropped.
-#[derive(Default)]
-pub(super) struct Buffer(Vec<f32>);
+pub(super) struct Buffer {
+    memory: Memory,
+    /// At most the capacity.
+    length: usize,
+}
 
 impl Buffer {
     /// `length` numbers of any value.
     pub fn any(length: usize) -> Self {
         let waiting = free().and_then(|mut free| {
-            let fits = |data: &Vec<f32>| (length..=length + length / 2).contains(&data.capacity());
+            let fits = |memory: &Memory| (length..=length + length / 2).contains(&memory.capacity);
             if let Some(place) = free.iter().rposition(fits) {
                 return Some(free.remove(place));
             }
             // What waits longest is of a size that nobody asks for.
             let mut freed = 0;
             while freed < length && !free.is_empty() {
-                freed += free.remove(0).capacity();
+                freed += free.remove(0).capacity;
             }
             None
         });
         // Graphs of one simulation have about as many edges from step to step.
-        let mut data = waiting.unwrap_or_else(|| Vec::with_capacity(length + length / 8));
-        data.resize(length, 0.0);
-        Self(data)
+        let memory = waiting.unwrap_or_else(|| Memory::new(length + length / 8));
+        Self { memory, length }
     }
 
     pub fn zeros(length: usize) -> Self {
@@ -55,16 +101,25 @@ impl Buffer {
     }
 }
 
+impl Default for Buffer {
+    fn default() -> Self {
+        Self {
+            memory: Memory::new(0),
+            length: 0,
+        }
+    }
+}
+
 impl Drop for Buffer {
     fn drop(&mut self) {
-        if self.0.capacity() == 0 {
+        if self.memory.capacity == 0 {
             return;
         }
         if let Some(mut free) = free() {
-            free.push(std::mem::take(&mut self.0));
-            let mut waiting: usize = free.iter().map(Vec::capacity).sum();
+            free.push(std::mem::replace(&mut self.memory, Memory::new(0)));
+            let mut waiting: usize = free.iter().map(|memory| memory.capacity).sum();
             while waiting > MOST {
-                waiting -= free.remove(0).capacity();
+                waiting -= free.remove(0).capacity;
             }
         }
     }
@@ -74,12 +129,14 @@ impl Deref for Buffer {
     type Target = [f32];
 
     fn deref(&self) -> &[f32] {
-        &self.0
+        // SAFETY: the memory is as long, or longer, and all of it has values.
+        unsafe { slice::from_raw_parts(self.memory.start.as_ptr(), self.length) }
     }
 }
 
 impl DerefMut for Buffer {
     fn deref_mut(&mut self) -> &mut [f32] {
-        &mut self.0
+        // SAFETY: as above, and nobody else has it.
+        unsafe { slice::from_raw_parts_mut(self.memory.start.as_ptr(), self.length) }
     }
 }

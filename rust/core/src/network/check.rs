@@ -28,15 +28,15 @@ impl Network<'_> {
         for layer in &self.layers {
             if let Some(edge) = &layer.edge {
                 check_mlp(edge, Some(3 * width))?;
-                require(edge.norm.is_some(), "perceptrons", || {
-                    "got an edge perceptron without a LayerNorm".into()
-                })?;
             }
             let summands = if with_edges { 2 } else { 1 };
             check_mlp(&layer.node, Some(summands * width))?;
             for mlp in layer.edge.iter().chain([&layer.node]) {
                 require(mlp.outputs() == width, "perceptrons", || {
                     format!("got a layer of {} outputs, must be {width}", mlp.outputs())
+                })?;
+                require(mlp.norm.is_some(), "perceptrons", || {
+                    "got a layer without a LayerNorm".into()
                 })?;
             }
             require(layer.edge.is_some() == with_edges, "perceptrons", || {

@@ -8,8 +8,8 @@
 //! the graph alone, and their sums are taken in order: results are the same for any number of
 //! threads.
 //!
-//! The backward pass needs every layer's edges. It takes them from the last layer's by undoing one
-//! residual after the other, so a step keeps no edges but the last. What rounding that adds is below
+//! The backward pass needs every layer's nodes and edges. It takes them from the last layer's by
+//! undoing one residual after the other, so a step keeps none but the last. What rounding that adds is below
 //! that of the passes themselves, unless LayerNorms scale by a thousand.
 
 mod buffer;
@@ -94,8 +94,6 @@ struct LayerTape {
     edge: Kept,
     node: Kept,
     incoming: Buffer,
-    /// The nodes before the layer.
-    nodes: Buffer,
 }
 
 /// Gradients of a number by all that it came from.
@@ -121,9 +119,21 @@ impl Network<'_> {
         self.node_encoder.outputs()
     }
 
-    /// The heads' outputs `[N, :]` each, and with `keep` what [`Self::backward`] needs.
+    /// How many numbers its parameters have.
+    fn parameters(&self) -> usize {
+        let of_layer = |layer: &Layer<'_>| {
+            layer.edge.as_ref().map_or(0, Mlp::parameters) + layer.node.parameters()
+        };
+        self.node_encoder.parameters()
+            + self.edge_encoder.as_ref().map_or(0, Mlp::parameters)
+            + self.layers.iter().map(of_layer).sum::<usize>()
+            + self.heads.iter().map(Mlp::parameters).sum::<usize>()
+    }
+
+    /// The heads' outputs `[N, :]` each, and with `keep` what [`Self::backward`] needs. A layer's
+    /// copies of its weights go with it.
     pub fn forward(
-        &self,
+        self,
         features: Features<'_>,
         keep: bool,
         threads: Threads,
@@ -135,7 +145,7 @@ impl Network<'_> {
     }
 
     fn pass_forward(
-        &self,
+        self,
         features: Features<'_>,
         keep: bool,
         team: &Team,
@@ -183,9 +193,8 @@ impl Network<'_> {
         }
 
         let mut layers = Vec::new();
-        for layer in &self.layers {
+        for layer in self.layers {
             let mut node = rows(&layer.node, count);
-            let before = keep.then(|| Buffer::copy(&nodes));
             let mut incoming = Buffer::default();
             let mut edge = None;
             if let (Some((_, graph)), Some(mlp)) = (features.edges, &layer.edge) {
@@ -204,13 +213,11 @@ impl Network<'_> {
                 );
             }
             pass.update_nodes(&layer.node, &incoming, &mut nodes, &mut node);
-            if let (Some(node), Some(nodes)) = (node, before) {
-                let edge = edge.unwrap_or_default();
+            if let Some(node) = node {
                 layers.push(LayerTape {
-                    edge,
+                    edge: edge.unwrap_or_default(),
                     node,
                     incoming,
-                    nodes,
                 });
             }
         }
@@ -240,7 +247,7 @@ impl Network<'_> {
     /// same parameters and `features` that kept `tape`. With `alone`, the heads behind the first
     /// learn without a word to the rest of the network.
     pub fn backward(
-        &self,
+        self,
         features: Features<'_>,
         tape: &mut Tape,
         heads: &[&[f32]],
@@ -255,7 +262,7 @@ impl Network<'_> {
     }
 
     fn pass_backward(
-        &self,
+        self,
         features: Features<'_>,
         tape: &mut Tape,
         heads: &[&[f32]],
@@ -270,8 +277,14 @@ impl Network<'_> {
             rows: count,
             team,
         };
-        // From the back: the order of the parameters, turned round.
-        let mut parameters: Vec<Buffer> = Vec::new();
+        let mut parameters = vec![0.0; self.parameters()];
+        let mut left = &mut parameters[..];
+        // From the back.
+        let mut put = |own: Buffer| {
+            let from = left.len() - own.len();
+            let place = left.split_off_mut(from..).expect("room for all parameters");
+            place.copy_from_slice(&own);
+        };
 
         let mut to_nodes = Buffer::zeros(count * width);
         let own = self.heads.iter().zip(&mut tape.heads).zip(heads);
@@ -281,18 +294,20 @@ impl Network<'_> {
             }
             let inputs = [whole_input(head, &tape.nodes)];
             let mut targets = [(&mut to_nodes[..], 0)];
-            parameters.push(pass.backward(head, &inputs, kept, gradient, &mut targets));
+            put(pass.backward(head, &inputs, kept, gradient, &mut targets));
         }
 
+        let mut nodes = Buffer::copy(&tape.nodes);
         let mut edges = Buffer::copy(&tape.edges);
         let mut to_edges = Buffer::zeros(edges.len());
         let parts = features.edges.map(|(_, graph)| graph.parts());
-        for (layer, tape) in self.layers.iter().zip(&mut tape.layers).rev() {
+        for (layer, tape) in self.layers.into_iter().zip(&mut tape.layers).rev() {
+            pass.undo(&layer.node, &mut tape.node, &mut nodes);
             let gradient = Buffer::copy(&to_nodes);
             let mut to_incoming = Buffer::zeros(tape.incoming.len());
             let column = layer.node.linears[0].inputs() - width;
             let own = Input {
-                rows: &tape.nodes,
+                rows: &nodes,
                 width,
                 column,
             };
@@ -309,7 +324,7 @@ impl Network<'_> {
             } else {
                 (vec![own], vec![(&mut to_nodes[..], column)])
             };
-            parameters.push(pass.backward(
+            put(pass.backward(
                 &layer.node,
                 &inputs,
                 &mut tape.node,
@@ -336,13 +351,13 @@ impl Network<'_> {
                 let of_nodes = pass.project_backward(
                     mlp,
                     graph,
-                    &tape.nodes,
+                    &nodes,
                     &to_receivers,
                     &to_first,
                     &mut to_nodes,
                 );
                 rows::add(&mut of_edges, &of_nodes);
-                parameters.push(of_edges);
+                put(of_edges);
             }
         }
 
@@ -353,35 +368,29 @@ impl Network<'_> {
             let lengths: Vec<usize> = parts.iter().map(|part| part.edges.len()).collect();
             let edge_count = lengths.iter().sum();
             by_edges = vec![0.0; values.len()];
-            parameters.push(
-                Pass {
-                    lengths: &lengths,
-                    rows: edge_count,
-                    team,
-                }
-                .backward(
-                    encoder,
-                    &[whole_input(encoder, values)],
-                    &mut tape.edge_encoder,
-                    &to_edges,
-                    &mut [(&mut by_edges[..], 0)],
-                ),
-            );
+            put(Pass {
+                lengths: &lengths,
+                rows: edge_count,
+                team,
+            }
+            .backward(
+                encoder,
+                &[whole_input(encoder, values)],
+                &mut tape.edge_encoder,
+                &to_edges,
+                &mut [(&mut by_edges[..], 0)],
+            ));
         }
         let mut by_nodes = vec![0.0; features.nodes.len()];
-        parameters.push(pass.backward(
+        put(pass.backward(
             &self.node_encoder,
             &[whole_input(&self.node_encoder, features.nodes)],
             &mut tape.node_encoder,
             &to_nodes,
             &mut [(&mut by_nodes[..], 0)],
         ));
-        parameters.reverse();
         Gradients {
-            parameters: parameters
-                .iter()
-                .flat_map(|part| part.iter().copied())
-                .collect(),
+            parameters,
             nodes: by_nodes,
             edges: by_edges,
         }
@@ -570,6 +579,23 @@ impl Pass<'_> {
         });
     }
 
+    /// Takes from `nodes` what [`Self::update_nodes`] has added.
+    fn undo(&self, mlp: &Mlp<'_>, kept: &mut Kept, nodes: &mut [f32]) {
+        let width = mlp.outputs();
+        let items: Vec<_> = (kept.parts(self.lengths, self.rows).into_iter())
+            .zip(split(nodes, self.lengths, self.rows))
+            .collect();
+        self.team.map(items, |(mut kept, nodes)| {
+            let mut update = Buffer::any(BLOCK * width);
+            let rows = nodes.len() / width;
+            for ((first, count), nodes) in blocks(rows).zip(nodes.chunks_mut(BLOCK * width)) {
+                let update = &mut update[..nodes.len()];
+                mlp.outputs_again(&kept.block(first, count, rows), update);
+                rows::subtract(nodes, update);
+            }
+        });
+    }
+
     /// The node parts of the first map of an edge perceptron: `[N, 2 width]`, what a node gives to
     /// the edges it receives, then what it gives to those it sends.
     fn project(&self, mlp: &Mlp<'_>, nodes: &[f32], width: usize) -> Buffer {
@@ -617,9 +643,11 @@ impl Pass<'_> {
             .zip(kept.parts(self.lengths, self.rows))
             .zip(of_parts)
             .collect();
-        let sums = self
-            .team
-            .map(items, |(((start, &length), mut kept), mut targets)| {
+        total(
+            self.team,
+            mlp,
+            items,
+            |(((start, &length), mut kept), mut targets)| {
                 let mut sum = Buffer::zeros(mlp.parameters());
                 let (mut here, mut there) =
                     (Buffer::any(BLOCK * widest), Buffer::any(BLOCK * widest));
@@ -639,8 +667,8 @@ impl Pass<'_> {
                     }
                 }
                 sum
-            });
-        total(sums, mlp)
+            },
+        )
     }
 
     /// Gradients of an edge perceptron's parameters (0 but for the node parts of its first map) by
@@ -660,7 +688,7 @@ impl Pass<'_> {
         let items: Vec<_> = starts(self.lengths)
             .zip(split(to_nodes, self.lengths, self.rows))
             .collect();
-        let sums = self.team.map(items, |(start, to_nodes)| {
+        total(self.team, mlp, items, |(start, to_nodes)| {
             let mut sum = Buffer::zeros(mlp.parameters());
             let count = to_nodes.len() / width;
             let mut to_senders = Buffer::zeros(to_nodes.len());
@@ -682,8 +710,7 @@ impl Pass<'_> {
                 mlp.add_input_gradient(gradient, end * width, width, to_nodes);
             }
             sum
-        });
-        total(sums, mlp)
+        })
     }
 }
 
@@ -762,7 +789,7 @@ fn edges_backward(
         .zip(split(to_first, &lengths, count))
         .zip(split(to_receivers, &nodes, graph.offsets.len() - 1))
         .collect();
-    let sums = team.map(items, |item| {
+    total(team, mlp, items, |item| {
         let (((((part, mut kept), edges), to_edges), to_first), to_receivers) = item;
         let mut sum = Buffer::zeros(mlp.parameters());
         let (mut here, mut there) = (Buffer::any(BLOCK * width), Buffer::any(BLOCK * width));
@@ -788,8 +815,7 @@ fn edges_backward(
             rows::add_at(to_receivers, width, before, receivers, part.nodes.start);
         }
         sum
-    });
-    total(sums, mlp)
+    })
 }
 
 /// How many edges and how many nodes each part has.
@@ -800,14 +826,19 @@ fn part_lengths(parts: &[Part]) -> (Vec<usize>, Vec<usize>) {
         .unzip()
 }
 
-/// The sum of the parts' sums, in order; of no parts, 0 for each parameter of `mlp`.
-fn total(sums: Vec<Buffer>, mlp: &Mlp<'_>) -> Buffer {
-    let mut sums = sums.into_iter();
-    let mut total = (sums.next()).unwrap_or_else(|| Buffer::zeros(mlp.parameters()));
-    for sum in sums {
+/// The parts' sums, as `of_part` gives them, added up in order; of no parts, 0 for each parameter of
+/// `mlp`.
+fn total<I: Send>(
+    team: &Team,
+    mlp: &Mlp<'_>,
+    parts: Vec<I>,
+    of_part: impl Fn(I) -> Buffer + Sync,
+) -> Buffer {
+    let sum = team.reduce(parts, of_part, |mut total, sum| {
         rows::add(&mut total, &sum);
-    }
-    total
+        total
+    });
+    sum.unwrap_or_else(|| Buffer::zeros(mlp.parameters()))
 }
 
 #[cfg(test)]
@@ -907,27 +938,29 @@ mod tests {
                 ]
             })
             .collect();
-        let mut mlps = data.iter().enumerate().map(|(i, data)| Mlp {
-            linears: vec![
-                Linear::new(&data[0], &data[1]),
-                Linear::new(&data[2], &data[3]),
-            ],
-            norm: (i < 6).then(|| Norm {
-                scale: &data[4],
-                shift: &data[5],
-            }),
-        });
-        let mut next = || mlps.next().expect("as many as sizes");
-        let network = Network {
-            node_encoder: next(),
-            edge_encoder: Some(next()),
-            layers: (0..2)
-                .map(|_| Layer {
-                    edge: Some(next()),
-                    node: next(),
-                })
-                .collect(),
-            heads: vec![next()],
+        let network = || {
+            let mut mlps = data.iter().enumerate().map(|(i, data)| Mlp {
+                linears: vec![
+                    Linear::new(&data[0], &data[1]),
+                    Linear::new(&data[2], &data[3]),
+                ],
+                norm: (i < 6).then(|| Norm {
+                    scale: &data[4],
+                    shift: &data[5],
+                }),
+            });
+            let mut next = || mlps.next().expect("as many as sizes");
+            Network {
+                node_encoder: next(),
+                edge_encoder: Some(next()),
+                layers: (0..2)
+                    .map(|_| Layer {
+                        edge: Some(next()),
+                        node: next(),
+                    })
+                    .collect(),
+                heads: vec![next()],
+            }
         };
         let (node_features, edge_features) = (numbers(7, nodes * 3), numbers(8, nodes * 2));
         let features = Features {
@@ -943,10 +976,10 @@ mod tests {
                 },
             )),
         };
-        let (out, tape) = network.forward(features, true, threads).unwrap();
+        let (out, tape) = network().forward(features, true, threads).unwrap();
         let ones = vec![1.0; out[0].len()];
         let mut tape = tape.unwrap();
-        let gradients = network
+        let gradients = network()
             .backward(features, &mut tape, &[&ones], false, threads)
             .unwrap();
         let all = [gradients.parameters, gradients.nodes, gradients.edges].concat();
