@@ -15,6 +15,8 @@ from rich.console import Console
 from adaptgns.checkpoint import LAST, read_checkpoint, write_checkpoint
 from adaptgns.fit import Diverged
 from adaptgns.reproduce import ReproduceConfig, main, reproduce, study_of
+from adaptgns.reproduce.estimates import seconds
+from adaptgns.reproduce.profiles import PROFILES
 from adaptgns.reproduce.report import MARKERS, write_into
 from adaptgns.reproduce.results import Estimate, Results, estimate
 from adaptgns.reproduce.runs import Run
@@ -287,6 +289,31 @@ def test_a_dry_run_lists_every_run_and_makes_none(
         assert re.search(rf"{re.escape(run.name)} +\d+\.\d\d h", printed)
     assert "together" in printed
     assert not (tmp_path / "study").exists()
+
+
+def test_a_dry_run_counts_what_is_missing(made: ReproduceConfig, tmp_path: Path) -> None:
+    def estimate(out: Path) -> float:
+        study = study_of(replace(made, out=out))
+        return seconds(next(run for run in study.runs() if run.name == "waterdrop/nll-0"))
+
+    out = tmp_path / "study"
+    shutil.copytree(folder(made), out)
+    (out / "metrics" / "waterdrop" / "nll-0-adaptive.json").unlink()
+    rollout = estimate(out)
+    (out / "training" / "waterdrop" / "nll-0" / "last.safetensors").unlink()
+    assert 0 < rollout < estimate(out) < estimate(tmp_path / "new")
+
+
+def test_a_dry_run_tells_what_the_gate_may_cost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    smoke = PROFILES["smoke"]
+    monkeypatch.setitem(PROFILES, "smoke", replace(smoke, gate=1.2, gate_steps=48))
+    config = ReproduceConfig(preset="smoke", out=tmp_path / "study", threads=1, dry_run=True)
+    reproduce(config, QUIET)
+    assert not capsys.readouterr().out
+    reproduce(config, Console(width=200))
+    assert "12 steps, or twice as many, and so on up to 48, until" in capsys.readouterr().out
 
 
 def test_several_at_a_time(made: ReproduceConfig, tmp_path: Path) -> None:

@@ -155,8 +155,19 @@ def list_runs(runs: Sequence[Run], console: Console) -> None:
             f"{run.name:40} {hours:8.2f} h  {round(run.model.share * run.data.steps):>11,} steps, "
             f"{', '.join(run.model.policies)}",
             highlight=False,
+            soft_wrap=True,
         )
     console.print(f"{'together':40} {total:8.2f} h, one after the other", highlight=False)
+    study = runs[0].study
+    profile, sets = study.profile, study.sets.values()
+    if profile.gate is not None and not all((data.metrics / "gate.json").exists() for data in sets):
+        console.print(
+            f"The gate comes first: the baseline trains for {profile.base.steps:,} steps, or twice "
+            f"as many, and so on up to {profile.gate_steps:,}, until its rollouts have at most "
+            f"{profile.gate:g} times the true edges. The others then train as long.",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def in_processes(config: ReproduceConfig, runs: Sequence[Run], console: Console) -> list[str]:

@@ -28,7 +28,8 @@ REPEATS = 3
 
 
 def seconds(run: Run) -> float:
-    """Of a run that has not begun, roughly: training steps and steps of the rollouts."""
+    """Of what is missing of a run, roughly: training steps, unless all are done, and steps of the
+    rollouts, which are taken to have as many edges as the true ones."""
     profile, model = run.study.profile, run.model
     train, test = (_particles(run, split) for split in ("train", "test"))
     base = replace(profile.base, device=run.study.device)
@@ -39,14 +40,14 @@ def seconds(run: Run) -> float:
     forward, both = _step(base, model.edges, model.loss, samples * train, factor)
     unrolled = 1 + (base.unroll - 1) / 2  # in the second half alone
     training = 0.0
-    if model.weights is None:
-        training = model.share * run.data.steps * both * unrolled
-    if model.graph == "adaptive":
-        training += model.share * run.data.steps * forward
+    if model.weights is None and not run.trained_whole:
+        a_step = both * unrolled + (forward if model.graph != "base" else 0.0)
+        training = model.share * run.data.steps * a_step
     one, _ = _step(base, model.edges, model.loss, test, factor)
     trajectories, frames = _test(run)
     steps = frames if profile.horizon is None else min(frames, profile.horizon)
-    passes = sum(2 if policy == "two-pass" else 1 for policy in model.policies)
+    missing = [policy for policy in model.policies if not run.metrics(policy).exists()]
+    passes = sum(2 if policy == "two-pass" else 1 for policy in missing)
     return training + 2 * passes * min(trajectories, profile.trajectories or trajectories) * (
         steps * one  # each rollout beside its single steps from true positions
     )

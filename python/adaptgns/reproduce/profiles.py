@@ -19,7 +19,6 @@ DENSER = 0.019 / 0.015
 """Radius of the paper's denser graph over that of its sparse one."""
 MIDDLE = 0.0176 / 0.015
 """The same for the one that matches the adaptive graph's edges on its sand."""
-POLICIES: tuple[PolicyName, ...] = ("fixed", "adaptive", "random", "two-pass", "knn")
 PRIORS: tuple[PolicyName, ...] = ("acceleration", "divergence")
 
 
@@ -73,7 +72,12 @@ class Model:
 
 MLP = Model("mlp", "MLP", "mse", edges=False)
 MSE = Model("mse", "GNS, MSE", "mse", policies=("fixed", "knn"))
-NLL = Model("nll", "GNS, NLL", "nll", policies=POLICIES)
+NLL = Model(
+    "nll",
+    "GNS, NLL",
+    "nll",
+    policies=("fixed", "adaptive", "random", "two-pass", "knn", "two-sided", *PRIORS),
+)
 TUNED = Model(
     "tuned", "AdaptGNS, chosen rule", "nll", policies=("adaptive", "random"), weights="nll"
 )
@@ -94,11 +98,18 @@ ADAPTIVE_NLL = replace(
     graph="adaptive",
     policies=("fixed", "adaptive", "random"),
 )
+TWO_SIDED_NLL = replace(
+    NLL,
+    name="nll-two-sided",
+    title="AdaptGNS, trained on two-sided graphs",
+    graph="two-sided",
+    policies=("fixed", "two-sided"),
+)
 DECOUPLED = Model(
     "decoupled",
     "GNS, decoupled",
     "decoupled",
-    policies=("fixed", "adaptive", "random"),
+    policies=("fixed", "adaptive", "random", "two-sided"),
 )
 VARIANTS = (
     DECOUPLED,
@@ -121,24 +132,24 @@ VARIANTS = (
         variance_weight=0.1,
         variance_ahead=True,
     ),
-    replace(
-        NLL,
-        name="nll-two-sided",
-        title="AdaptGNS, trained on two-sided graphs",
-        graph="two-sided",
-        policies=("fixed", "two-sided"),
-    ),
+    TWO_SIDED_NLL,
 )
 PAPER_MODELS = (
     replace(MSE, policies=(*MSE.policies, *PRIORS)),
-    replace(NLL, policies=(*POLICIES, "two-sided", *PRIORS)),
+    NLL,
     MLP,
     *VARIANTS,
     *EARLY,
     replace(MSE, name="mse-denser", title="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)),
     replace(NLL, name="nll-middle", title="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)),
     ADAPTIVE_NLL,
-    replace(NLL, name="beta-nll", title="GNS, beta-NLL", loss="beta-nll"),
+    replace(
+        NLL,
+        name="beta-nll",
+        title="GNS, beta-NLL",
+        loss="beta-nll",
+        policies=("fixed", "adaptive", "random"),
+    ),
     replace(
         MSE, name="mse-matched", title="GNS, MSE, matched r", radius="matched", policies=("fixed",)
     ),
@@ -185,7 +196,7 @@ PROFILES: dict[ProfileName, Profile] = {
         base=replace(PRESETS["smoke"], steps=12, validate_every=12, validate_horizon=5),
         models=(
             MSE,
-            replace(NLL, policies=(*POLICIES, "two-sided", *PRIORS)),
+            NLL,
             MLP,
             EARLY[1],
             DECOUPLED,
@@ -206,7 +217,7 @@ PROFILES: dict[ProfileName, Profile] = {
     ),
     "laptop": Profile(
         base=PRESETS["laptop"],
-        models=(MSE, NLL, MLP, *EARLY, ADAPTIVE_NLL, TUNED),
+        models=(MSE, NLL, MLP, DECOUPLED, TWO_SIDED_NLL, *EARLY, ADAPTIVE_NLL, TUNED),
         sweep=Sweep(trajectories=5),
         seeds=(0, 1, 2),
         marks=(50, 100, 200),

@@ -383,6 +383,15 @@ class Run:
         """Whether everything has been measured."""
         return all(self.metrics(policy).exists() for policy in self.model.policies)
 
+    @property
+    def trained_whole(self) -> bool:
+        """Whether its training has come to its end."""
+        last = self.folder / LAST
+        if not last.exists():
+            return False
+        checkpoint = self._own(last)
+        return checkpoint.step == checkpoint.config.steps and checkpoint.validated
+
     def config(self) -> TrainConfig:
         """Of the training. StudyError where it depends on runs that are missing."""
         base = replace(self.study.profile.base, steps=self.data.steps, data=self.data.source)
@@ -460,11 +469,9 @@ class Run:
             device=self.study.device,
             threads=self.study.threads,
         )
-        last = self.folder / LAST
-        if last.exists():
-            checkpoint = self._own(last)
-            if checkpoint.step == config.steps and checkpoint.validated:
-                return
+        if self.trained_whole:
+            return
+        if (self.folder / LAST).exists():
             config = replace(config, resume=self.folder)
         console.print(f"{self.name}: training", highlight=False)
         train(config, console, ALONE)
