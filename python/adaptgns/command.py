@@ -25,5 +25,11 @@ def plain_errors(*also: type[Exception]) -> Iterator[None]:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None
     except told as error:
-        print(f"error: {str(error) or type(error).__name__}", file=sys.stderr)
+        print(f"error: {_described(error)}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def _described(error: Exception) -> str:
+    if isinstance(error, (FileExistsError, NotADirectoryError)) and error.filename is not None:
+        return f"{error.filename}: a file is where a folder is needed"
+    return str(error) or type(error).__name__

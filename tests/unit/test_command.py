@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -50,3 +51,11 @@ def test_sigterm_undoes_what_is_half_done(capsys: pytest.CaptureFixture[str]) ->
     assert exit_.value.code == 143
     assert capsys.readouterr().err == "terminated\n"
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_file_in_the_way_of_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(SystemExit), plain_errors():
+            folder.mkdir(parents=True, exist_ok=True)
+        assert f"error: {folder}: a file is where a folder is needed" in capsys.readouterr().err
