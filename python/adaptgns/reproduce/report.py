@@ -11,6 +11,7 @@ from markdown import markdown
 
 from adaptgns.atomic import replace_text, write_json
 from adaptgns.reproduce import figures
+from adaptgns.reproduce.profiles import PRIORS
 from adaptgns.reproduce.results import Results
 from adaptgns.reproduce.runs import Study, read_json
 from adaptgns.reproduce.tables import Row, Table, tables
@@ -35,6 +36,8 @@ th, td { padding: 3px 9px; border-bottom: 1px solid #dde2e8; text-align: right; 
 th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left; }
 img { max-width: 100%; }
 """
+EXPLAINING = ("two-pass", "knn", *PRIORS)
+"""Policies that the README leaves to the report"""
 MARKERS = ("<!-- results -->", "<!-- end of results -->")
 
 
@@ -57,7 +60,7 @@ def write(study: Study) -> list[Path]:
 
 def write_into(study: Study, readme: Path) -> None:
     """Replace what lies between the two marks in ``readme`` by the tables of the rollouts, of the
-    models that were trained in full."""
+    models that were trained in full, without the policies that are there to explain others."""
     text = readme.read_text("utf-8")
     start, end = (text.find(marker) for marker in MARKERS)
     if start < 0 or end < start:
@@ -75,7 +78,7 @@ def write_into(study: Study, readme: Path) -> None:
             rows = [
                 Row([row.cells[i] for i in kept])
                 for row in table.rows
-                if row.cells[0] not in partial
+                if row.cells[0] not in partial and row.cells[1] not in EXPLAINING
             ]
             short = Table(table.name, table.title, [table.columns[i] for i in kept], rows)
             parts.append(f"**{table.title}**\n\n{_table(short)}")
