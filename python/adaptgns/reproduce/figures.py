@@ -31,6 +31,7 @@ COLOURS = {
     "nll": SERIES[1],
     "mlp": SERIES[5],
     "nll-adaptive": SERIES[2],
+    "nll-two-sided": "#2f5fc9",
     "beta-nll": SERIES[3],
     "mse-denser": SERIES[4],
     "tuned": "#b0528f",
