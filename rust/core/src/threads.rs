@@ -305,6 +305,26 @@ mod tests {
     }
 
     #[test]
+    fn results_are_joined_in_order() {
+        for threads in [Threads::All, Threads::AtMost(NonZeroUsize::MIN)] {
+            for count in [0_usize, 1, 2, 300] {
+                let joined = team(threads, |team| {
+                    let task = |i: usize| {
+                        std::thread::sleep(std::time::Duration::from_micros((i as u64 * 37) % 90));
+                        vec![i]
+                    };
+                    team.reduce((0..count).collect(), task, |mut all, next| {
+                        all.extend(next);
+                        all
+                    })
+                });
+                let expected = (count > 0).then(|| (0..count).collect::<Vec<_>>());
+                assert_eq!(joined, expected);
+            }
+        }
+    }
+
+    #[test]
     fn beside_a_team_one_works_alone() {
         let shares = |threads| {
             let ids = team(threads, |team| {
