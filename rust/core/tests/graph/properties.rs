@@ -216,10 +216,10 @@ pub fn uniform(count: usize) -> Vec<f64> {
 
 #[test]
 fn radius_graph_equals_kiddo() {
-    let positions = uniform(20_000);
+    let positions = uniform(40_000);
     let points = positions.as_chunks::<2>().0;
     let tree: ImmutableKdTree<f64, 2> = ImmutableKdTree::new_from_slice(points).unwrap();
-    let r = 0.015;
+    let r = 0.01;
     let case = Case::open(2, positions.clone());
     let built =
         radius_graph::<_, f64>(&case.particles(), Radius::Uniform(r), &case.options(0)).unwrap();
@@ -240,8 +240,12 @@ fn radius_graph_equals_kiddo() {
 
 #[test]
 fn any_number_of_threads_gives_the_same_graph() {
-    for dim in [2, 3] {
-        let n = 30_000;
+    let n = 30_000;
+    let graphs = [None, Some(vec![0, 10_000, 10_000, 10_007, n as i64])];
+    for (dim, ptr) in [2, 3]
+        .into_iter()
+        .flat_map(|dim| graphs.clone().map(|ptr| (dim, ptr)))
+    {
         let sigma = uniform(n);
         let radii: Vec<f64> = sigma.iter().map(|s| 0.01 + 0.02 * s).collect();
         let expansion = Expansion {
@@ -251,7 +255,7 @@ fn any_number_of_threads_gives_the_same_graph() {
             eligible: None,
         };
         let case = Case {
-            ptr: Some(vec![0, 10_000, 10_000, 10_007, n as i64]),
+            ptr,
             ..Case::open(dim, uniform(n * dim))
         };
         let build = |threads| {
@@ -267,6 +271,58 @@ fn any_number_of_threads_gives_the_same_graph() {
         let alone = build(1);
         for threads in [0, 2, 3, 8] {
             assert_eq!(build(threads), alone);
+        }
+    }
+}
+
+#[test]
+fn the_percentile_of_many_is_that_of_all_of_them() {
+    let n = 20_000;
+    let random = uniform(n);
+    // Where a sample is taken at equal distances, it misleads.
+    let sampled = |i: usize| i.is_multiple_of(n / 512);
+    let sigmas: [Vec<f64>; 5] = [
+        random.clone(),
+        (0..n).map(|i| random[i] + f64::from(sampled(i))).collect(),
+        (0..n)
+            .map(|i| random[i] - f64::from(sampled(i)))
+            .map(|x| x.max(0.0))
+            .collect(),
+        (0..n).map(|i| (i % 3) as f64).collect(),
+        vec![0.5; n],
+    ];
+    let masks: [Option<Vec<bool>>; 4] = [
+        None,
+        Some((0..n).map(|i| i.is_multiple_of(997)).collect()),
+        Some((0..n).map(|i| i == n / 2).collect()),
+        Some(vec![false; n]),
+    ];
+    let case = Case::open(2, uniform(2 * n));
+    let (particles, options, r, factor) = (case.particles(), case.options(0), 0.01, 1.5);
+    for (sigma, eligible) in sigmas
+        .iter()
+        .flat_map(|s| masks.iter().map(move |m| (s, m)))
+    {
+        let counts = |i: usize| eligible.as_ref().is_none_or(|eligible| eligible[i]);
+        let mut sorted: Vec<f64> = (0..n).filter(|&i| counts(i)).map(|i| sigma[i]).collect();
+        sorted.sort_by(f64::total_cmp);
+        for tau in [0.0, 12.5, 70.0, 99.99, 100.0] {
+            // Above the percentile lies what is above the value at its place, or the last before.
+            let place = sorted.len().saturating_sub(1) as f64 * (tau / 100.0);
+            let before = sorted.get(place as usize);
+            let high = |i| counts(i) && before.is_some_and(|&before| sigma[i] > before);
+            let radius = |i| if high(i) { factor * r } else { r };
+            let radii: Vec<f64> = (0..n).map(radius).collect();
+            let expansion = Expansion {
+                sigma,
+                tau,
+                factor,
+                eligible: eligible.as_deref(),
+            };
+            assert_eq!(
+                adaptive_graph(&particles, r, &expansion, &options).unwrap(),
+                radius_graph(&particles, Radius::PerParticle(&radii), &options).unwrap(),
+            );
         }
     }
 }
