@@ -9,6 +9,8 @@ use super::scalar::Scalar;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "x86_64")]
+mod network;
 
 /// Numbers to the longest block.
 pub(super) const LONGEST: usize = 16;
@@ -72,7 +74,7 @@ fn kind() -> Kind {
         && is_x86_feature_detected!("popcnt")
     {
         Kind::Avx512
-    } else if is_x86_feature_detected!("avx2") {
+    } else if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("popcnt") {
         Kind::Avx2
     } else {
         Kind::Portable

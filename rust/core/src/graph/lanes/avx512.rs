@@ -9,6 +9,7 @@ use std::arch::x86_64::{
     _mm512_shuffle_i32x4, _mm512_storeu_si512,
 };
 
+use super::network::{Keys, write_network};
 use super::{LONGEST as BLOCK, Lanes, Scalar, Work};
 use crate::graph::order::NONE;
 
@@ -49,13 +50,12 @@ impl Lanes<BLOCK> for Avx512 {
 
     #[inline(always)]
     unsafe fn write_sorted(self, row: &[i32], n: usize, dropped: i32, out: *mut i64) {
-        debug_assert!(n <= 4 * BLOCK && n <= row.len());
         // SAFETY: promised by the caller.
         unsafe {
             match n.div_ceil(BLOCK) {
-                0 | 1 => write_network::<1>(row, n, dropped, out),
-                2 => write_network::<2>(row, n, dropped, out),
-                _ => write_network::<4>(row, n, dropped, out),
+                0 | 1 => write_network::<__m512i, 1>(row, n, dropped, out),
+                2 => write_network::<__m512i, 2>(row, n, dropped, out),
+                _ => write_network::<__m512i, 4>(row, n, dropped, out),
             }
         }
     }
@@ -64,48 +64,6 @@ impl Lanes<BLOCK> for Avx512 {
     fn prefetch<T>(self, place: *const T) {
         // SAFETY: it reads nothing that the program sees, whatever the place.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(place.cast()) }
-    }
-}
-
-/// [`Lanes::write_sorted`] of at most `K` blocks, by Batcher's bitonic network: which numbers are
-/// compared depends on their places alone, so there is no branch, and each comparison is of whole
-/// vectors. What is absent or dropped counts as [`NONE`], which comes last.
-///
-/// # Safety
-/// The processor has AVX-512, `n` is at most `K` blocks and the row's length, and `out` has room
-/// for whole blocks of `n` numbers.
-#[inline(always)]
-unsafe fn write_network<const K: usize>(row: &[i32], n: usize, dropped: i32, out: *mut i64) {
-    // SAFETY: promised by the caller; what a mask leaves out is not read.
-    unsafe {
-        let none = _mm512_set1_epi32(NONE);
-        let mut blocks: [__m512i; K] = std::array::from_fn(|k| {
-            let left = n.saturating_sub(k * BLOCK).min(BLOCK);
-            let present = ((1_u32 << left) - 1) as u16;
-            let keys = _mm512_mask_loadu_epi32(none, present, row.as_ptr().wrapping_add(k * BLOCK));
-            let kept = _mm512_mask_cmpneq_epi32_mask(present, keys, _mm512_set1_epi32(dropped));
-            sorted(_mm512_mask_mov_epi32(none, kept, keys), K == 1 && n <= HALF)
-        });
-        let mut size = 1;
-        while size < K {
-            for pair in blocks.chunks_exact_mut(2 * size) {
-                merge(pair);
-            }
-            size *= 2;
-        }
-        for (k, &block) in blocks.iter().enumerate() {
-            let out = out.add(k * BLOCK);
-            let halves = [
-                _mm512_castsi512_si256(block),
-                _mm512_extracti64x4_epi64::<1>(block),
-            ];
-            for (h, half) in halves.into_iter().enumerate() {
-                if k * BLOCK + h * HALF >= n {
-                    return;
-                }
-                _mm512_storeu_si512(out.add(h * HALF).cast(), _mm512_cvtepi32_epi64(half));
-            }
-        }
     }
 }
 
@@ -142,58 +100,69 @@ unsafe fn step<const SIZE: usize, const STRIDE: usize>(keys: __m512i) -> __m512i
     }
 }
 
-/// The block in ascending order, or as much of it as `half` of it needs.
-///
-/// # Safety
-/// The processor has AVX-512.
-#[inline(always)]
-unsafe fn sorted(keys: __m512i, half: bool) -> __m512i {
-    // SAFETY: promised by the caller.
-    unsafe {
-        let keys = step::<2, 1>(keys);
-        let keys = step::<4, 1>(step::<4, 2>(keys));
-        let keys = step::<8, 1>(step::<8, 2>(step::<8, 4>(keys)));
-        if half { keys } else { ascending(keys) }
+impl Keys for __m512i {
+    const LANES: usize = BLOCK;
+
+    #[inline(always)]
+    unsafe fn load(row: *const i32, n: usize, dropped: i32) -> Self {
+        // SAFETY: promised by the caller; what a mask leaves out is not read.
+        unsafe {
+            let none = _mm512_set1_epi32(NONE);
+            let present = ((1_u32 << n) - 1) as u16;
+            let keys = _mm512_mask_loadu_epi32(none, present, row);
+            let kept = _mm512_mask_cmpneq_epi32_mask(present, keys, _mm512_set1_epi32(dropped));
+            _mm512_mask_mov_epi32(none, kept, keys)
+        }
     }
-}
 
-/// A block that rises and then falls, or the other way round, in ascending order.
-///
-/// # Safety
-/// The processor has AVX-512.
-#[inline(always)]
-unsafe fn ascending(keys: __m512i) -> __m512i {
-    // SAFETY: promised by the caller.
-    unsafe { step::<16, 1>(step::<16, 2>(step::<16, 4>(step::<16, 8>(keys)))) }
-}
-
-/// Merges the sorted halves of `blocks`.
-///
-/// # Safety
-/// The processor has AVX-512.
-#[inline(always)]
-unsafe fn merge(blocks: &mut [__m512i]) {
-    let half = blocks.len() / 2;
-    // SAFETY: promised by the caller.
-    unsafe {
-        let reversed = _mm512_setr_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
-        blocks[half..].reverse();
-        for block in &mut blocks[half..] {
-            *block = _mm512_permutexvar_epi32(reversed, *block);
-        }
-        let mut stride = half;
-        while stride > 0 {
-            for run in blocks.chunks_exact_mut(2 * stride) {
-                for b in 0..stride {
-                    let (one, other) = (run[b], run[b + stride]);
-                    run[b] = _mm512_min_epi32(one, other);
-                    run[b + stride] = _mm512_max_epi32(one, other);
-                }
+    #[inline(always)]
+    unsafe fn write(self, n: usize, out: *mut i64) {
+        // SAFETY: promised by the caller.
+        unsafe {
+            let low = _mm512_castsi512_si256(self);
+            _mm512_storeu_si512(out.cast(), _mm512_cvtepi32_epi64(low));
+            if n > HALF {
+                let high = _mm512_extracti64x4_epi64::<1>(self);
+                _mm512_storeu_si512(out.add(HALF).cast(), _mm512_cvtepi32_epi64(high));
             }
-            stride /= 2;
         }
-        for block in blocks {
-            *block = ascending(*block);
+    }
+
+    #[inline(always)]
+    unsafe fn lesser(self, other: Self) -> Self {
+        // SAFETY: promised by the caller.
+        unsafe { _mm512_min_epi32(self, other) }
+    }
+
+    #[inline(always)]
+    unsafe fn greater(self, other: Self) -> Self {
+        // SAFETY: promised by the caller.
+        unsafe { _mm512_max_epi32(self, other) }
+    }
+
+    #[inline(always)]
+    unsafe fn reversed(self) -> Self {
+        // SAFETY: promised by the caller.
+        unsafe {
+            let places = _mm512_setr_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
+            _mm512_permutexvar_epi32(places, self)
         }
+    }
+
+    #[inline(always)]
+    unsafe fn sorted(self, half: bool) -> Self {
+        // SAFETY: promised by the caller.
+        unsafe {
+            let keys = step::<2, 1>(self);
+            let keys = step::<4, 1>(step::<4, 2>(keys));
+            let keys = step::<8, 1>(step::<8, 2>(step::<8, 4>(keys)));
+            if half { keys } else { keys.ascending() }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn ascending(self) -> Self {
+        // SAFETY: promised by the caller.
+        unsafe { step::<16, 1>(step::<16, 2>(step::<16, 4>(step::<16, 8>(self)))) }
     }
 }
