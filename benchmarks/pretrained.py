@@ -2,8 +2,8 @@
 
     python benchmarks/pretrained.py results/laptop
 
-Of each data set's NLL models the one with the lowest validation error, with nothing in it of where
-it was made. Their metrics are those of the study: ``metrics/DATA/nll-SEED-*.json``.
+Of each data set's NLL models that were trained longest the one with the lowest validation error,
+with nothing in it of where it was made. Their metrics are those of the study: ``metrics/DATA/nll-400-SEED-*.json``.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from pathlib import Path
 
 from adaptgns.checkpoint import PRETRAINED, Checkpoint, read_checkpoint, write_checkpoint
 from adaptgns.data.default import EMBEDDED
+from adaptgns.reproduce.profiles import LONG_NLL
 
 
 def main() -> None:
     for name in EMBEDDED:
-        folders = sorted((Path(sys.argv[1]) / "training" / name).glob("nll-[0-9]"))
+        folders = sorted((Path(sys.argv[1]) / "training" / name).glob(f"{LONG_NLL.name}-[0-9]"))
         made: dict[Path, Checkpoint] = {folder: read_checkpoint(folder) for folder in folders}
         best = min(made, key=lambda folder: made[folder].best_score)
         config = replace(made[best].config, data=name, out=None, resume=None, threads=None)

@@ -239,7 +239,7 @@ def _reliability(results: Results, sets: list[DataSet]) -> Figure:
                     one,
                     other,
                     color=colour(series),
-                    alpha=0.4 + 0.6 * series.model.share,
+                    alpha=min(1.0, 0.4 + 0.6 * series.model.share),
                     linestyle="-" if series.model.share == 1 else ":",
                     marker="o",
                     markersize=2.5,

@@ -39,6 +39,10 @@ class Model:
     variance_layers: int = 1
     share: float = 1.0
     """Of the profile's training steps"""
+    seeds: int | None = None
+    """How many of the profile's seeds, from the first; None: all"""
+    timed_as: str | None = None
+    """Name of the model whose steps take as long, being of the same network"""
     policies: tuple[PolicyName, ...] = ("fixed",)
     weights: str | None = None
     """Name of the model whose training it uses, under the rule that the sweep chose"""
@@ -87,9 +91,18 @@ EARLY = tuple(
         name=f"nll-{percent}",
         title=f"GNS, NLL, {percent} % of the steps",
         share=percent / 100,
+        timed_as="nll",
         policies=("fixed", "adaptive", "random"),
     )
     for percent in (10, 30)
+)
+LONG_NLL = replace(
+    NLL,
+    name="nll-400",
+    title="GNS, NLL, 400 % of the steps, one seed",
+    share=4.0,
+    seeds=1,
+    timed_as="nll",
 )
 ADAPTIVE_NLL = replace(
     NLL,
@@ -190,6 +203,10 @@ class Profile:
     plans: Mapping[str, Mapping[str, SplitPlan]] = field(default_factory=dict)
     """Data sets that are generated for this profile instead of the embedded ones"""
 
+    def seeds_of(self, model: Model) -> tuple[int, ...]:
+        """Those that ``model`` is trained with."""
+        return self.seeds[: model.seeds]
+
 
 PROFILES: dict[ProfileName, Profile] = {
     "smoke": Profile(
@@ -199,6 +216,7 @@ PROFILES: dict[ProfileName, Profile] = {
             NLL,
             MLP,
             EARLY[1],
+            LONG_NLL,
             DECOUPLED,
             TUNED,
         ),
@@ -217,7 +235,7 @@ PROFILES: dict[ProfileName, Profile] = {
     ),
     "laptop": Profile(
         base=PRESETS["laptop"],
-        models=(MSE, NLL, MLP, DECOUPLED, TWO_SIDED_NLL, *EARLY, ADAPTIVE_NLL, TUNED),
+        models=(MSE, NLL, MLP, DECOUPLED, TWO_SIDED_NLL, *EARLY, LONG_NLL, ADAPTIVE_NLL, TUNED),
         sweep=Sweep(trajectories=5),
         seeds=(0, 1, 2),
         marks=(50, 100, 200),

@@ -140,7 +140,7 @@ class Results:
         }
 
     def _series(self, data: DataSet, model: Model, policy: PolicyName) -> Series:
-        runs = tuple(Run(data, model, seed) for seed in self.study.profile.seeds)
+        runs = tuple(Run(data, model, seed) for seed in self.study.profile.seeds_of(model))
         return Series(model, policy, runs)
 
     def of(self, data: str) -> list[Series]:

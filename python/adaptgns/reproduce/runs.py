@@ -101,7 +101,7 @@ class Study:
             for seed in self.profile.seeds:
                 for data in self.sets.values():
                     for model in self.profile.models:
-                        if model.depends == depends:
+                        if model.depends == depends and seed in self.profile.seeds_of(model):
                             yield Run(data, model, seed)
 
     @property
@@ -261,6 +261,7 @@ class DataSet:
         """Time a step under every model and policy in ``runs``, in turns, on true positions of one
         test trajectory."""
         path = self.metrics / "times.json"
+        runs = [run for run in runs if run.model.timed_as is None]
         names = {f"{run.model.name}, {policy}" for run in runs for policy in run.model.policies}
         if path.exists() and names <= set(read_json(path)["times"]):
             return
@@ -310,7 +311,7 @@ class DataSet:
 
     def step_time(self, model: Model, policy: PolicyName) -> dict[str, float]:
         """Of :attr:`times`, those of one model under one policy."""
-        name, times = f"{model.name}, {policy}", self.times["times"]
+        name, times = f"{model.timed_as or model.name}, {policy}", self.times["times"]
         if name not in times:
             raise StudyError(
                 f"{self.metrics / 'times.json'}: has no step of {name}; the command without "

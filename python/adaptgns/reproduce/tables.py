@@ -42,6 +42,13 @@ Comparison = tuple[str, tuple[str, PolicyName], tuple[str, PolicyName]]
 COMPARISONS: tuple[Comparison, ...] = (
     ("adaptive or fixed graph, same model", ("nll", "adaptive"), ("nll", "fixed")),
     ("uncertain or random particles expanded", ("nll", "adaptive"), ("nll", "random")),
+    (
+        "adaptive or fixed, trained four times as long",
+        ("nll-400", "adaptive"),
+        ("nll-400", "fixed"),
+    ),
+    ("uncertain or random, trained so", ("nll-400", "adaptive"), ("nll-400", "random")),
+    ("two-sided or fixed, trained so", ("nll-400", "two-sided"), ("nll-400", "fixed")),
     ("sigma of the step before or of this one", ("nll", "adaptive"), ("nll", "two-pass")),
     ("adaptive NLL or fixed MSE: the aim", ("nll", "adaptive"), ("mse", "fixed")),
     ("the chosen rule or fixed MSE: the aim", ("tuned", "adaptive"), ("mse", "fixed")),
@@ -236,8 +243,8 @@ def _rollouts(results: Results, data: DataSet) -> Table:
             "model ms",
         ),
         rows,
-        "Means over seeds and trajectories, in brackets the 95 % interval for both as samples "
-        "(adaptgns.reproduce.results). Edges are directed and without self-edges. The ratio is "
+        "Means over seeds and trajectories, in brackets the 95 % interval for both as samples, of one "
+        "seed for the trajectories alone (adaptgns.reproduce.results). Edges are directed and without self-edges. The ratio is "
         "that of edges within the data's radius on predicted over true positions, of their means "
         f"over all steps, and at step {mark} the mean of ratios: above 1, the predicted particles "
         "clump. Milliseconds of a step are medians of all models and policies in turns, on true "
@@ -413,7 +420,8 @@ def _along(results: Results, data: DataSet) -> Table:
             "edges a step",
         ),
         rows,
-        "Each row's models were trained from the start with a schedule of that length.",
+        "Each row's models were trained from the start with a schedule of that length, those of more "
+        "than 100 % with one seed: their intervals are for the trajectories alone.",
     )
 
 
