@@ -49,6 +49,12 @@ COMPARISONS: tuple[Comparison, ...] = (
     ),
     ("uncertain or random, trained so", ("nll-400", "adaptive"), ("nll-400", "random")),
     ("two-sided or fixed, trained so", ("nll-400", "two-sided"), ("nll-400", "fixed")),
+    (
+        "sigma or the divergence around, trained so",
+        ("nll-400", "adaptive"),
+        ("nll-400", "divergence"),
+    ),
+    ("the divergence around or fixed, trained so", ("nll-400", "divergence"), ("nll-400", "fixed")),
     ("sigma of the step before or of this one", ("nll", "adaptive"), ("nll", "two-pass")),
     ("adaptive NLL or fixed MSE: the aim", ("nll", "adaptive"), ("mse", "fixed")),
     ("the chosen rule or fixed MSE: the aim", ("tuned", "adaptive"), ("mse", "fixed")),
@@ -243,8 +249,9 @@ def _rollouts(results: Results, data: DataSet) -> Table:
             "model ms",
         ),
         rows,
-        "Means over seeds and trajectories, in brackets the 95 % interval for both as samples, of one "
-        "seed for the trajectories alone (adaptgns.reproduce.results). Edges are directed and without self-edges. The ratio is "
+        "Means over seeds and trajectories, in brackets the 95 % interval for both as samples, of "
+        "one seed for the trajectories alone (adaptgns.reproduce.results). Edges are directed and "
+        "without self-edges. The ratio is "
         "that of edges within the data's radius on predicted over true positions, of their means "
         f"over all steps, and at step {mark} the mean of ratios: above 1, the predicted particles "
         "clump. Milliseconds of a step are medians of all models and policies in turns, on true "
@@ -420,8 +427,8 @@ def _along(results: Results, data: DataSet) -> Table:
             "edges a step",
         ),
         rows,
-        "Each row's models were trained from the start with a schedule of that length, those of more "
-        "than 100 % with one seed: their intervals are for the trajectories alone.",
+        "Each row's models were trained from the start with a schedule of that length, those of "
+        "more than 100 % with one seed: their intervals are for the trajectories alone.",
     )
 
 
@@ -453,8 +460,8 @@ def _calibration(results: Results, data: DataSet) -> list[Table]:
                 ("decile of sigma", "mean squared error", "d·σ²", "|Δ|"),
                 rows,
                 "One step from true positions, normalized units, deciles of each seed averaged "
-                f"over {len(errors)} seeds. Rank correlation of sigma and error "
-                f"{ranks.mean():.2f} ({ranks.min():.2f} to {ranks.max():.2f} over the seeds).",
+                f"over the seeds. Rank correlation of sigma and error {ranks.mean():.2f} "
+                f"({', '.join(f'{rank:.2f}' for rank in ranks)}).",
             )
         )
     return made
