@@ -273,7 +273,8 @@ def test_the_readme_gets_the_tables_between_its_marks(
     assert text.endswith(f"{MARKERS[1]}\nafter\n")
     assert "old" not in text
     assert "| GNS, NLL | adaptive |" in text
-    for left_out in ("% of the steps", "two-pass", "divergence"):  # those are for the report alone
+    assert "400 % of the steps" in text
+    for left_out in ("30 % of the steps", "two-pass", "divergence"):  # those are for the report alone
         assert left_out not in text
     assert re.search(r"Made on \d{4}-\d\d-\d\d .* cores", text)
     readme.write_text("no marks")
