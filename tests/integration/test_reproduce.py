@@ -274,7 +274,8 @@ def test_the_readme_gets_the_tables_between_its_marks(
     assert "old" not in text
     assert "| GNS, NLL | adaptive |" in text
     assert "400 % of the steps" in text
-    for left_out in ("30 % of the steps", "two-pass", "divergence"):  # those are for the report alone
+    # Those are for the report alone.
+    for left_out in ("30 % of the steps", "two-pass", "divergence"):
         assert left_out not in text
     assert re.search(r"Made on \d{4}-\d\d-\d\d .* cores", text)
     readme.write_text("no marks")
