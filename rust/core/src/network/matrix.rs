@@ -1,6 +1,7 @@
 //! Products of matrices that fit the cache.
 
 use super::rows::vectorized;
+use super::vector::Vector;
 
 /// Numbers read where they lie.
 #[derive(Clone, Copy)]
@@ -75,108 +76,34 @@ pub(super) enum Start<'a> {
     Row(&'a [f32]),
 }
 
+/// What becomes of a product's numbers on their way into memory.
+#[derive(Clone, Copy)]
+pub(super) enum End<'a> {
+    /// They stay.
+    Whole,
+    /// Negative ones become 0; NaN stays.
+    Relu,
+    /// All become 0 but where these numbers, laid out like the product's, are positive.
+    WherePositive(&'a [f32]),
+}
+
 vectorized! {
     /// `out`, whose rows are `stride` numbers apart, becomes `start` plus the product of `a` and
-    /// `b`, whose rows must be contiguous.
-    kinds product(
+    /// `b`, whose rows must be contiguous, and then what `end` says.
+    fn product(
         out: &mut [f32],
         stride: usize,
         start: Start<'_>,
         a: Matrix<'_>,
         b: Matrix<'_>,
-    )
-    // Tiles as large as the registers hold.
-    [
-        v4 => tiles::<std::arch::x86_64::__m512, 8, 2>(out, stride, start, a, b),
-        v3 => tiles::<std::arch::x86_64::__m256, 6, 2>(out, stride, start, a, b),
-        plain => tiles::<[f32; 4], 4, 2>(out, stride, start, a, b),
-    ]
-}
-
-/// Some numbers in one register. Only for processors that have such.
-trait Vector: Copy {
-    const LANES: usize;
-    /// # Safety
-    /// The processor has such registers; `LANES` numbers are at `from`.
-    unsafe fn load(from: *const f32) -> Self;
-    /// # Safety
-    /// The processor has such registers; there is room for `LANES` numbers at `to`.
-    unsafe fn store(self, to: *mut f32);
-    /// # Safety
-    /// The processor has such registers.
-    unsafe fn all(number: f32) -> Self;
-    /// `self + a * b`
-    /// # Safety
-    /// The processor has such registers.
-    unsafe fn add_product(self, a: Self, b: Self) -> Self;
-}
-
-impl<const N: usize> Vector for [f32; N] {
-    const LANES: usize = N;
-
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: as promised.
-        unsafe { *from.cast() }
-    }
-
-    #[inline(always)]
-    unsafe fn store(self, to: *mut f32) {
-        // SAFETY: as promised.
-        unsafe { *to.cast() = self }
-    }
-
-    #[inline(always)]
-    unsafe fn all(number: f32) -> Self {
-        [number; N]
-    }
-
-    #[inline(always)]
-    unsafe fn add_product(self, a: Self, b: Self) -> Self {
-        std::array::from_fn(|i| self[i] + a[i] * b[i])
+        end: End<'_>,
+    ) {
+        tiles::<Lanes, { <Lanes as Vector>::TILE }, 2>(out, stride, start, a, b, end)
     }
 }
 
-/// A [`Vector`] by four intrinsics.
-#[cfg(target_arch = "x86_64")]
-macro_rules! vector {
-    ($($kind:ident $lanes:literal $load:ident $store:ident $all:ident $add_product:ident,)*) => {
-        $(impl Vector for std::arch::x86_64::$kind {
-            const LANES: usize = $lanes;
-
-            #[inline(always)]
-            unsafe fn load(from: *const f32) -> Self {
-                // SAFETY: as promised.
-                unsafe { std::arch::x86_64::$load(from) }
-            }
-
-            #[inline(always)]
-            unsafe fn store(self, to: *mut f32) {
-                // SAFETY: as promised.
-                unsafe { std::arch::x86_64::$store(to, self) }
-            }
-
-            #[inline(always)]
-            unsafe fn all(number: f32) -> Self {
-                // SAFETY: as promised.
-                unsafe { std::arch::x86_64::$all(number) }
-            }
-
-            #[inline(always)]
-            unsafe fn add_product(self, a: Self, b: Self) -> Self {
-                // SAFETY: as promised.
-                unsafe { std::arch::x86_64::$add_product(a, b, self) }
-            }
-        })*
-    };
-}
-#[cfg(target_arch = "x86_64")]
-vector! {
-    __m512 16 _mm512_loadu_ps _mm512_storeu_ps _mm512_set1_ps _mm512_fmadd_ps,
-    __m256 8 _mm256_loadu_ps _mm256_storeu_ps _mm256_set1_ps _mm256_fmadd_ps,
-}
-
-/// A product to be taken: `out`, of rows `stride` apart, begins with `start` and gets `a` times `b`.
+/// A product to be taken: `out`, of rows `stride` apart, begins with `start`, gets `a` times `b`
+/// and becomes what `end` says.
 #[derive(Clone, Copy)]
 struct Task<'a> {
     out: *mut f32,
@@ -184,6 +111,7 @@ struct Task<'a> {
     start: Start<'a>,
     a: Matrix<'a>,
     b: Matrix<'a>,
+    end: End<'a>,
 }
 
 /// Tile by tile of `R` rows, at most 8, and `C` vectors.
@@ -194,6 +122,7 @@ fn tiles<V: Vector, const R: usize, const C: usize>(
     start: Start<'_>,
     a: Matrix<'_>,
     b: Matrix<'_>,
+    end: End<'_>,
 ) {
     let (rows, columns) = (a.rows, b.columns);
     assert_eq!(a.columns, b.rows, "inner sizes");
@@ -201,9 +130,13 @@ fn tiles<V: Vector, const R: usize, const C: usize>(
         return;
     }
     assert!(a.extent() <= a.data.len() && b.extent() <= b.data.len() && b.column_stride == 1);
-    assert!(columns <= stride && (rows - 1) * stride + columns <= out.len());
+    let extent = (rows - 1) * stride + columns;
+    assert!(columns <= stride && extent <= out.len());
     if let Start::Row(row) = start {
         assert!(columns <= row.len());
+    }
+    if let End::WherePositive(like) = end {
+        assert!(extent <= like.len());
     }
     let task = Task {
         out: out.as_mut_ptr(),
@@ -211,6 +144,7 @@ fn tiles<V: Vector, const R: usize, const C: usize>(
         start,
         a,
         b,
+        end,
     };
     let mut column = 0;
     // SAFETY: as just asserted, all that is read and written lies in the slices; the caller has
@@ -272,11 +206,13 @@ unsafe fn tile<V: Vector, const R: usize, const C: usize>(
         start,
         a,
         b,
+        end,
     } = task;
     // SAFETY: rows `row..row + R` and the vectors from `column` are inside, as the callers see to;
     // `out` overlaps neither matrix, being borrowed alone.
     unsafe {
-        let out = out.add(row * stride + column);
+        let first = row * stride + column;
+        let out = out.add(first);
         let mut sums = [[V::all(0.0); C]; R];
         for i in 0..R {
             for j in 0..C {
@@ -300,6 +236,19 @@ unsafe fn tile<V: Vector, const R: usize, const C: usize>(
                 let of_a = V::all(*left.add(i * a.row_stride + k * a.column_stride));
                 for j in 0..C {
                     sums[i][j] = sums[i][j].add_product(of_a, of_b[j]);
+                }
+            }
+        }
+        match end {
+            End::Whole => {}
+            End::Relu => sums = sums.map(|row| row.map(|sum| sum.relu())),
+            End::WherePositive(like) => {
+                let like = like.as_ptr().add(first);
+                for i in 0..R {
+                    for j in 0..C {
+                        let of_like = V::load(like.add(i * stride + j * V::LANES));
+                        sums[i][j] = sums[i][j].where_positive(of_like);
+                    }
                 }
             }
         }

@@ -1,7 +1,7 @@
 //! Perceptrons over blocks of rows: all layers of a block while it lies in the cache.
 
 use super::buffer::Buffer;
-use super::matrix::{Matrix, Start, product};
+use super::matrix::{End, Matrix, Start, product};
 use super::rows;
 use std::ops::DerefMut;
 use std::sync::OnceLock;
@@ -169,21 +169,21 @@ impl<'a> Mlp<'a> {
                 None => &mut *out,
             };
             let outputs = linear.outputs();
+            let end = if i < last { End::Relu } else { End::Whole };
             if let Some(begin) = begin.take() {
                 let mut start = begin(target, linear.bias);
-                for input in inputs {
+                for (number, input) in inputs.iter().enumerate() {
                     let rows = Matrix::new(input.rows, input.width);
                     let weight = linear.forward().rows(input.column, input.width);
-                    product(target, outputs, start, rows, weight);
+                    let whole = number + 1 == inputs.len();
+                    let end = if whole { end } else { End::Whole };
+                    product(target, outputs, start, rows, weight, end);
                     start = Start::There;
                 }
             } else {
                 let rows = Matrix::new(before[i - 1], linear.inputs());
                 let start = Start::Row(linear.bias);
-                product(target, outputs, start, rows, linear.forward());
-            }
-            if i < last {
-                rows::relu(target);
+                product(target, outputs, start, rows, linear.forward(), end);
             }
         }
         if let Some(norm) = self.norm {
@@ -237,16 +237,30 @@ impl<'a> Mlp<'a> {
                 for input in inputs {
                     let inner = Matrix::new(input.rows, input.width);
                     let target = &mut to_weight[input.column..];
-                    product(target, columns, Start::There, outer.transposed(), inner);
+                    product(
+                        target,
+                        columns,
+                        Start::There,
+                        outer.transposed(),
+                        inner,
+                        End::Whole,
+                    );
                 }
                 break;
             }
             let activation = &*kept.hidden[i - 1];
             let inner = Matrix::new(activation, columns);
-            product(to_weight, columns, Start::There, outer.transposed(), inner);
+            product(
+                to_weight,
+                columns,
+                Start::There,
+                outer.transposed(),
+                inner,
+                End::Whole,
+            );
             let before = &mut spare[..rows * columns];
-            product(before, columns, Start::Zero, outer, linear.backward());
-            rows::relu_backward(before, activation);
+            let end = End::WherePositive(activation);
+            product(before, columns, Start::Zero, outer, linear.backward(), end);
             (gradient, spare) = (spare, gradient);
         }
         &gradient[..rows * self.linears[0].outputs()]
@@ -264,7 +278,7 @@ impl<'a> Mlp<'a> {
         let first = &self.linears[0];
         let weight = first.backward().columns(column, width);
         let outer = Matrix::new(gradient, first.outputs());
-        product(out, width, Start::There, outer, weight);
+        product(out, width, Start::There, outer, weight, End::Whole);
     }
 }
 

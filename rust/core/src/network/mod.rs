@@ -17,6 +17,7 @@ mod check;
 mod matrix;
 mod mlp;
 mod rows;
+mod vector;
 
 use std::ops::Range;
 
@@ -24,7 +25,7 @@ pub use mlp::{Linear, Mlp, Norm};
 
 use crate::threads::{self, Team, Threads};
 use buffer::Buffer;
-use matrix::{Matrix, Start, product};
+use matrix::{End, Matrix, Start, product};
 use mlp::{Input, Kept, KeptMut, split};
 
 /// Rows that go through a perceptron at once.
@@ -610,7 +611,7 @@ impl Pass<'_> {
             for end in 0..2 {
                 let weight = first.rows(end * width, width);
                 let out = out.get_mut(end * width..).unwrap_or_default();
-                product(out, 2 * width, Start::Zero, nodes, weight);
+                product(out, 2 * width, Start::Zero, nodes, weight, End::Whole);
             }
         });
         out
@@ -706,7 +707,14 @@ impl Pass<'_> {
                 .enumerate()
             {
                 let outer = Matrix::new(gradient, width).transposed();
-                product(&mut sum[end * width..], columns, Start::There, outer, inner);
+                product(
+                    &mut sum[end * width..],
+                    columns,
+                    Start::There,
+                    outer,
+                    inner,
+                    End::Whole,
+                );
                 mlp.add_input_gradient(gradient, end * width, width, to_nodes);
             }
             sum
@@ -865,7 +873,7 @@ mod tests {
         #[test]
         fn products_are_sums_of_products(
             rows in 0usize..21, inner in 0usize..9, columns in 1usize..75, gap in 0usize..3,
-            transposed: bool, start in 0usize..3, kind in 0usize..3, seed: u64,
+            transposed: bool, start in 0usize..3, end in 0usize..3, kind in 0usize..3, seed: u64,
         ) {
             let most = [Processor::Plain, Processor::V3, Processor::V4][kind];
             MOST.set(most);
@@ -881,8 +889,10 @@ mod tests {
                 Matrix::new(&left, inner.max(1))
             };
             let start = [Start::There, Start::Zero, Start::Row(&row)][start];
+            let like = numbers(seed ^ 4, rows * stride);
+            let end = [End::Whole, End::Relu, End::WherePositive(&like)][end];
             if rows > 0 && inner > 0 {
-                product(&mut out, stride, start, a, Matrix::new(&right, columns));
+                product(&mut out, stride, start, a, Matrix::new(&right, columns), end);
             }
             for i in 0..rows {
                 for j in 0..stride {
@@ -898,9 +908,33 @@ mod tests {
                             let place = if transposed { k * rows + i } else { i * inner + k };
                             expected += f64::from(left[place]) * f64::from(right[k * columns + j]);
                         }
+                        expected = match end {
+                            End::Whole => expected,
+                            End::Relu => expected.max(0.0),
+                            End::WherePositive(like) if like[i * stride + j] > 0.0 => expected,
+                            End::WherePositive(_) => 0.0,
+                        };
                     }
                     prop_assert!((f64::from(out[i * stride + j]) - expected).abs() < 1e-5);
                 }
+            }
+            MOST.set(Processor::V4);
+        }
+    }
+
+    #[test]
+    fn nan_stays_and_is_not_positive() {
+        for most in [Processor::Plain, Processor::V3, Processor::V4] {
+            MOST.set(most);
+            for columns in [1, 8, 16, 32] {
+                let (nan, one) = (vec![f32::NAN; columns], [1.0]);
+                let (nans, ones) = (Matrix::new(&nan, columns), Matrix::new(&one, 1));
+                let mut out = vec![0.0; columns];
+                product(&mut out, columns, Start::Zero, ones, nans, End::Relu);
+                assert!(out.iter().all(|x| x.is_nan()), "{most:?}, {columns}");
+                let end = End::WherePositive(&nan);
+                product(&mut out, columns, Start::Row(&[1.0; 32]), ones, nans, end);
+                assert!(out.iter().all(|&x| x == 0.0), "{most:?}, {columns}");
             }
             MOST.set(Processor::V4);
         }

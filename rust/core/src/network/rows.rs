@@ -1,27 +1,27 @@
 //! Elementwise work on blocks of rows, compiled for the widest vectors of the processor at hand.
 
-/// Compiles each function for several kinds of processor and calls the best there is. A function
-/// has one body for all of them, or, as `kinds`, one for each: `v4` with AVX-512, `v3` with AVX2 and FMA, `plain`.
+use super::vector::Vector;
+
+/// Compiles each function for several kinds of processor and calls the best there is. In its body,
+/// `Lanes` are the [`super::vector::Vector`] of that kind.
 macro_rules! vectorized {
-    ($($(#[$doc:meta])* fn $name:ident($($argument:ident: $kind:ty),* $(,)?) $body:block)*) => {
-        $(vectorized! {
-            $(#[$doc])* kinds $name($($argument: $kind),*)
-            [v4 => $body, v3 => $body, plain => $body,]
-        })*
-    };
-    (
-        $(#[$doc:meta])*
-        kinds $name:ident($($argument:ident: $kind:ty),* $(,)?)
-        [v4 => $wide:expr, v3 => $middle:expr, plain => $narrow:expr,]
-    ) => {
+    ($($(#[$doc:meta])* fn $name:ident($($argument:ident: $kind:ty),* $(,)?) $body:block)*) => {$(
         $(#[$doc])*
         pub(super) fn $name($($argument: $kind),*) {
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
-                fn v4($($argument: $kind),*) { $wide }
+                fn v4($($argument: $kind),*) {
+                    #[allow(dead_code, reason = "not every body names it")]
+                    type Lanes = std::arch::x86_64::__m512;
+                    $body
+                }
                 #[target_feature(enable = "avx2,fma")]
-                fn v3($($argument: $kind),*) { $middle }
+                fn v3($($argument: $kind),*) {
+                    #[allow(dead_code, reason = "not every body names it")]
+                    type Lanes = std::arch::x86_64::__m256;
+                    $body
+                }
                 match $crate::network::rows::processor() {
                     // SAFETY: the processor has them.
                     $crate::network::rows::Processor::V4 => return unsafe { v4($($argument),*) },
@@ -30,9 +30,11 @@ macro_rules! vectorized {
                     $crate::network::rows::Processor::Plain => {}
                 }
             }
-            $narrow
+            #[allow(dead_code, reason = "not every body names it")]
+            type Lanes = [f32; 4];
+            $body
         }
-    };
+    )*};
 }
 pub(super) use vectorized;
 
@@ -75,38 +77,44 @@ pub(super) fn processor() -> Processor {
 /// What is added to the variance under a LayerNorm's root, torch's default.
 const EPSILON: f32 = 1e-5;
 
-/// Sum of `f` of each pair of numbers, in an order that does not hinder vectors.
+/// The sum of the numbers of `a`, or of their products with those of `b`, as many.
+///
+/// # Safety
+/// The processor has such vectors.
 #[inline(always)]
-fn sum(a: &[f32], b: &[f32], f: impl Fn(f32, f32) -> f32) -> f32 {
-    const LANES: usize = 16;
-    let mut lanes = [0.0f32; LANES];
-    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
-    for (a, b) in a.iter().zip(b) {
-        for i in 0..LANES {
-            lanes[i] += f(a[i], b[i]);
+unsafe fn sum<V: Vector>(a: &[f32], b: Option<&[f32]>) -> f32 {
+    const WIDEST: usize = 16;
+    assert!(V::LANES <= WIDEST && b.is_none_or(|b| a.len() == b.len()));
+    let pairs = a.len() - a.len() % (2 * V::LANES);
+    let whole = a.len() - a.len() % V::LANES;
+    // SAFETY: `whole` numbers lie in both slices, and in a padded one as many as a vector has.
+    unsafe {
+        let add = |sum: V, first: usize| {
+            let factor = b.map_or(V::all(1.0), |b| V::load(b.as_ptr().add(first)));
+            sum.add_product(V::load(a.as_ptr().add(first)), factor)
+        };
+        // Two sums, since an addition waits for the one before it.
+        let (mut even, mut odd) = (V::all(0.0), V::all(0.0));
+        for first in (0..pairs).step_by(2 * V::LANES) {
+            even = add(even, first);
+            odd = add(odd, first + V::LANES);
         }
+        if pairs < whole {
+            even = add(even, pairs);
+        }
+        if whole < a.len() {
+            let padded = |of: &[f32]| {
+                let mut padded = [0.0; WIDEST];
+                padded[..of.len() - whole].copy_from_slice(&of[whole..]);
+                V::load(padded.as_ptr())
+            };
+            odd = odd.add_product(padded(a), b.map_or(V::all(1.0), padded));
+        }
+        even.add_product(odd, V::all(1.0)).sum()
     }
-    for i in 0..a_rest.len() {
-        lanes[i] += f(a_rest[i], b_rest[i]);
-    }
-    lanes.iter().sum()
 }
 
 vectorized! {
-    /// Negative numbers become 0; NaN stays.
-    fn relu(rows: &mut [f32]) {
-        for x in rows {
-            *x = if *x < 0.0 { 0.0 } else { *x };
-        }
-    }
-
-    /// Where `activation` is not positive, `gradient` becomes 0.
-    fn relu_backward(gradient: &mut [f32], activation: &[f32]) {
-        for (g, &h) in gradient.iter_mut().zip(activation) {
-            *g = if h > 0.0 { *g } else { 0.0 };
-        }
-    }
-
     /// `out += values`
     fn add(out: &mut [f32], values: &[f32]) {
         for (o, &v) in out.iter_mut().zip(values) {
@@ -187,11 +195,16 @@ vectorized! {
     /// inverse is kept.
     fn normalize(rows: &mut [f32], width: usize, inverse_std: &mut [f32]) {
         for (row, inverse) in rows.chunks_exact_mut(width).zip(inverse_std) {
-            let mean = sum(row, row, |x, _| x) / width as f32;
-            let variance = sum(row, row, |x, _| (x - mean) * (x - mean)) / width as f32;
+            // SAFETY: `Lanes` are of the processor at hand.
+            let mean = unsafe { sum::<Lanes>(row, None) } / width as f32;
+            for x in &mut *row {
+                *x -= mean;
+            }
+            // SAFETY: as above.
+            let variance = unsafe { sum::<Lanes>(row, Some(row)) } / width as f32;
             *inverse = 1.0 / (variance + EPSILON).sqrt();
             for x in row {
-                *x = (*x - mean) * *inverse;
+                *x *= *inverse;
             }
         }
     }
@@ -225,8 +238,10 @@ vectorized! {
                 to_shift[i] += *g;
                 *g *= scale[i];
             }
-            let mean = sum(gradient, row, |g, _| g) / width as f32;
-            let along = sum(gradient, row, |g, x| g * x) / width as f32;
+            // SAFETY: `Lanes` are of the processor at hand.
+            let mean = unsafe { sum::<Lanes>(gradient, None) } / width as f32;
+            // SAFETY: as above.
+            let along = unsafe { sum::<Lanes>(gradient, Some(row)) } / width as f32;
             for (g, &x) in gradient.iter_mut().zip(row) {
                 *g = inverse * (*g - mean - x * along);
             }
