@@ -1,4 +1,4 @@
-//! Criterion benchmarks of the graph builders: `cargo bench`.
+//! Criterion benchmarks of the graph builders: `cargo bench -p adaptgns-bench`.
 
 use std::hint::black_box;
 
