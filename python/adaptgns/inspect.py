@@ -34,6 +34,9 @@ _RADII = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0)
 _SUSPICIOUS = 2.0
 """Stored and computed standard deviations further apart than this factor are told."""
 
+_FEW, _MANY = 0.5, 4.0
+"""Mean degrees below and above these multiples of the usual one are told."""
+
 
 @dataclass(frozen=True)
 class InspectConfig:
@@ -81,6 +84,10 @@ def inspect(config: InspectConfig, console: Console) -> list[Problem]:
         )
     elif find_split(folder, config.split) is None:
         open_split(folder, config.split)  # its error says what the folder holds
+    if "train" in splits and find_split(folder, "valid") is None:
+        problems.append(
+            Problem(f"{folder}: a train split, but no valid; training needs both", fatal=False)
+        )
     for trajectories in splits.values():
         found = {problem.message for problem in problems}
         problems += [
@@ -201,7 +208,7 @@ def _print_graphs(
     title = f"graph at r = {radius:g}, frame {config.frame}{note}, {len(usable)} trajectories"
     _print_statistics(console, title, statistics)
     _print_degree_over_time(console, radius, metadata, split, usable)
-    _print_degree_by_radius(console, radius, metadata, frames)
+    _print_degree_by_radius(console, radius, metadata, frames, problems)
 
 
 def _print_statistics(console: Console, title: str, statistics: list[GraphStatistics]) -> None:
@@ -233,7 +240,11 @@ def _print_degree_over_time(
 
 
 def _print_degree_by_radius(
-    console: Console, radius: float, metadata: Metadata, frames: list[np.ndarray]
+    console: Console,
+    radius: float,
+    metadata: Metadata,
+    frames: list[np.ndarray],
+    problems: list[Problem],
 ) -> None:
     curve = DegreeCurve(frames, radius * max(_RADII), metadata.box)
     table = _table(console, "mean degree by radius", "radius", "mean degree")
@@ -247,10 +258,13 @@ def _print_degree_by_radius(
             f"too few particles for {target:g} neighbours each; any radius that joins them is fine"
         )
     else:
+        degree = curve.degree(radius)
         text = (
             f"r = {advised:.4g} gives {target:g} neighbours on average, the usual number in "
-            f"{metadata.dim}D; r = {radius:g} gives {curve.degree(radius):.3g}"
+            f"{metadata.dim}D; r = {radius:g} gives {degree:.3g}"
         )
+        if not _FEW * target <= degree <= _MANY * target:
+            problems.append(Problem(f"radius: {text}", fatal=False))
     console.print(f"radius: {text}", soft_wrap=True)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import h5py
@@ -48,6 +49,24 @@ def test_report_of_a_good_data_set(drops: Path, capsys: pytest.CaptureFixture[st
 def test_another_split_and_radius(drops: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = report(capsys, str(drops), "--split", "train", "--radius", "0.03")
     assert "graph at r = 0.03, frame 100 (the last frame in 3 shorter ones), 3 traj" in told
+
+
+@pytest.mark.parametrize(("radius", "far_off"), [("0.002", True), ("0.015", False), ("0.2", True)])
+def test_a_radius_far_off_is_a_problem(
+    drops: Path, capsys: pytest.CaptureFixture[str], radius: str, far_off: bool
+) -> None:
+    told = report(capsys, str(drops), "--radius", radius)
+    assert ("problems: 1" in told) == far_off
+    assert ("warning: radius: r = " in told) == far_off
+
+
+def test_a_missing_valid_split_is_a_problem(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in drops.iterdir():
+        if path.stem != "valid":
+            shutil.copy(path, tmp_path)
+    assert "a train split, but no valid" in report(capsys, str(tmp_path))
 
 
 def test_narrow_terminals(
