@@ -96,6 +96,15 @@ EARLY = tuple(
     )
     for percent in (10, 30)
 )
+LONG_MSE = replace(
+    MSE,
+    name="mse-400",
+    title="GNS, MSE, 400 % of the steps, one seed",
+    share=4.0,
+    seeds=1,
+    timed_as="mse",
+    policies=("fixed", "divergence"),
+)
 LONG_NLL = replace(
     NLL,
     name="nll-400",
@@ -217,6 +226,7 @@ PROFILES: dict[ProfileName, Profile] = {
             MLP,
             EARLY[1],
             LONG_NLL,
+            LONG_MSE,
             DECOUPLED,
             TUNED,
         ),
@@ -235,7 +245,7 @@ PROFILES: dict[ProfileName, Profile] = {
     ),
     "laptop": Profile(
         base=PRESETS["laptop"],
-        models=(MSE, NLL, MLP, DECOUPLED, TWO_SIDED_NLL, *EARLY, LONG_NLL, ADAPTIVE_NLL, TUNED),
+        models=(MSE, NLL, MLP, DECOUPLED, TWO_SIDED_NLL, *EARLY, LONG_NLL, LONG_MSE, ADAPTIVE_NLL, TUNED),
         sweep=Sweep(trajectories=5),
         seeds=(0, 1, 2),
         marks=(50, 100, 200),
