@@ -55,6 +55,22 @@ COMPARISONS: tuple[Comparison, ...] = (
         ("nll-400", "divergence"),
     ),
     ("the divergence around or fixed, trained so", ("nll-400", "divergence"), ("nll-400", "fixed")),
+    (
+        "adaptive NLL or fixed MSE, trained so: the aim",
+        ("nll-400", "adaptive"),
+        ("mse-400", "fixed"),
+    ),
+    (
+        "two-sided NLL or fixed MSE, trained so: the aim",
+        ("nll-400", "two-sided"),
+        ("mse-400", "fixed"),
+    ),
+    ("NLL or MSE, fixed graphs, trained so", ("nll-400", "fixed"), ("mse-400", "fixed")),
+    (
+        "the divergence around or fixed, MSE trained so",
+        ("mse-400", "divergence"),
+        ("mse-400", "fixed"),
+    ),
     ("sigma of the step before or of this one", ("nll", "adaptive"), ("nll", "two-pass")),
     ("adaptive NLL or fixed MSE: the aim", ("nll", "adaptive"), ("mse", "fixed")),
     ("the chosen rule or fixed MSE: the aim", ("tuned", "adaptive"), ("mse", "fixed")),
