@@ -133,8 +133,7 @@ DECOUPLED = Model(
     "decoupled",
     policies=("fixed", "adaptive", "random", "two-sided"),
 )
-VARIANTS = (
-    DECOUPLED,
+DECOUPLED_VARIANTS = (
     replace(
         DECOUPLED,
         name="decoupled-weight",
@@ -154,28 +153,42 @@ VARIANTS = (
         variance_weight=0.1,
         variance_ahead=True,
     ),
-    TWO_SIDED_NLL,
+)
+WIDER = (
+    replace(MSE, name="mse-denser", title="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)),
+    replace(NLL, name="nll-middle", title="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)),
+)
+BETA_NLL = replace(
+    NLL,
+    name="beta-nll",
+    title="GNS, beta-NLL",
+    loss="beta-nll",
+    policies=("fixed", "adaptive", "random"),
 )
 PAPER_MODELS = (
     replace(MSE, policies=(*MSE.policies, *PRIORS)),
     NLL,
     MLP,
-    *VARIANTS,
+    DECOUPLED,
+    *DECOUPLED_VARIANTS,
+    TWO_SIDED_NLL,
     *EARLY,
-    replace(MSE, name="mse-denser", title="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)),
-    replace(NLL, name="nll-middle", title="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)),
+    *WIDER,
     ADAPTIVE_NLL,
-    replace(
-        NLL,
-        name="beta-nll",
-        title="GNS, beta-NLL",
-        loss="beta-nll",
-        policies=("fixed", "adaptive", "random"),
-    ),
+    BETA_NLL,
     replace(
         MSE, name="mse-matched", title="GNS, MSE, matched r", radius="matched", policies=("fixed",)
     ),
     TUNED,
+)
+ONE_SEED = tuple(
+    replace(
+        model,
+        title=f"{model.title}, one seed",
+        seeds=1,
+        policies=tuple(p for p in model.policies if p in ("fixed", "adaptive", "random")),
+    )
+    for model in (*DECOUPLED_VARIANTS, BETA_NLL, *WIDER)
 )
 
 
@@ -255,6 +268,7 @@ PROFILES: dict[ProfileName, Profile] = {
             LONG_NLL,
             LONG_MSE,
             ADAPTIVE_NLL,
+            *ONE_SEED,
             TUNED,
         ),
         sweep=Sweep(trajectories=5),
