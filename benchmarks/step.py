@@ -49,9 +49,9 @@ GPU_SIZES = {
     "width 128, 10 steps, 20,000 particles": (20_000, 156_000, 128, 2, 10),
     "width 128, 10 steps, 200,000 particles": (200_000, 1_560_000, 128, 2, 10),
 }
-FORMS = ("plain", "torch", "core", "plain bf16", "torch bf16")
+FORMS = ("plain", "torch", "core", "plain bf16", "torch bf16", "core bf16")
 """plain: see above; torch: what runs on GPUs; core: what runs on CPUs; bf16: plain under autocast,
-torch as ``--precision bf16`` has it"""
+the others as ``--precision bf16`` has them"""
 GPU_FORMS = ("plain", "torch", "compiled", "plain bf16", "torch bf16", "compiled bf16")
 """compiled: torch by torch.compile, any number of particles and edges"""
 
@@ -99,7 +99,7 @@ class Case:
         self.edges = torch.randn(len(self.graph.senders), 3).to(self.device)
 
     def outputs(self, form: str) -> list[Tensor]:
-        fused.applies = lambda _: form == "core"
+        fused.applies = lambda _: form.startswith("core")
         low = "bf16" in form
         if form.startswith("plain"):
             with torch.autocast(self.device.type, torch.bfloat16) if low else nullcontext():

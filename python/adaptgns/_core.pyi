@@ -146,9 +146,10 @@ def network_forward(
     *,
     heads: int,
     keep: bool,
+    bf16: bool = False,
     threads: int | None = None,
 ) -> tuple[list[_Floats], NetworkTape | None]:
-    """The encode-process-decode network (Sanchez-Gonzalez et al. 2020) in float32.
+    """The encode-process-decode network (Sanchez-Gonzalez et al. 2020).
 
     All arrays are C-contiguous. Results are the same for any number of threads.
 
@@ -164,6 +165,8 @@ def network_forward(
             None for a network without edges.
         heads: how many of the last perceptrons are read from the last step's nodes.
         keep: whether a backward pass follows.
+        bf16: whether the factors of products, but for those of the heads, are rounded to bf16; their
+            sums and all else are float32.
         threads: how many threads may work on the call, all cores if absent.
 
     Returns:
@@ -181,6 +184,7 @@ def network_backward(
     gradients: Sequence[_Floats],
     *,
     alone: bool = False,
+    bf16: bool = False,
     threads: int | None = None,
 ) -> tuple[_Floats, _Floats, _Floats]:
     """The way back through :func:`network_forward` with the same arguments.

@@ -1,4 +1,4 @@
-"""The whole network in the Rust core, for float32 on the CPU.
+"""The whole network in the Rust core, for the CPU.
 
 The same sums as :mod:`adaptgns.network` does with torch, in another order: a block of rows goes
 through all layers of a perceptron while it lies in the cache, and less is kept for the way back.
@@ -52,10 +52,12 @@ def network(
     *,
     heads: int,
     alone: bool = False,
+    bf16: bool = False,
 ) -> list[Tensor]:
     """Outputs ``[N, :]`` of the last ``heads`` of the ``perceptrons``: node encoder, edge encoder,
     each step's edge and node perceptron, heads; without ``graph`` no edge perceptrons. With
-    ``alone`` the heads behind the first send no gradients to the rest of the network."""
+    ``alone`` the heads behind the first send no gradients to the rest of the network; with ``bf16``
+    the factors of products are rounded so, but for those of the heads."""
     parameters = [list(perceptron.parameters()) for perceptron in perceptrons]
     sizes = [len(own) for own in parameters]
     flat = [parameter for own in parameters for parameter in own]
@@ -67,7 +69,9 @@ def network(
     inputs = [node_features, edge_features, *index, *flat]
     # Not what `forward` can see, where no gradients are taken and parameters ask for them anyway.
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
-    out: tuple[Tensor, ...] = _Network.apply(len(index), sizes, heads, alone, keep, *inputs)
+    out: tuple[Tensor, ...] = _Network.apply(
+        len(index), sizes, heads, alone, bf16, keep, *inputs
+    )
     return list(out)
 
 
@@ -92,6 +96,7 @@ class _Network(torch.autograd.Function):
         sizes: list[int],
         heads: int,
         alone: bool,
+        bf16: bool,
         keep: bool,
         node_features: Tensor,
         edge_features: Tensor | None,
@@ -104,9 +109,11 @@ class _Network(torch.autograd.Function):
             _edges(index, edge_features),
             heads=heads,
             keep=keep,
+            bf16=bf16,
             threads=_thread_count(),
         )
-        ctx.indices, ctx.sizes, ctx.alone, ctx.tape = indices, sizes, alone, tape
+        ctx.indices, ctx.sizes, ctx.tape = indices, sizes, tape
+        ctx.alone, ctx.bf16 = alone, bf16
         ctx.save_for_backward(node_features, edge_features, *rest)
         return tuple(torch.from_numpy(output) for output in outputs)
 
@@ -122,6 +129,7 @@ class _Network(torch.autograd.Function):
             ctx.tape,
             [_array(gradient) for gradient in gradients],
             alone=ctx.alone,
+            bf16=ctx.bf16,
             threads=_thread_count(),
         )
         parts = torch.split(torch.from_numpy(of_parameters), [p.numel() for p in parameters])
@@ -129,7 +137,7 @@ class _Network(torch.autograd.Function):
         if edge_features is not None:
             to_edges = torch.from_numpy(of_edges).view_as(edge_features)
         return (
-            *(None,) * 5,
+            *(None,) * 6,
             torch.from_numpy(of_nodes).view_as(node_features),
             to_edges,
             *(None,) * ctx.indices,

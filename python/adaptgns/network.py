@@ -84,9 +84,9 @@ class EncodeProcessDecode(nn.Module):
     variance head, and no message ever arrives. With ``variance_alone`` what the variance head
     learns changes nothing else.
 
-    ``precision`` may be changed at any time. With bf16 the latents of the edges and the products
-    of the encoders and of message passing are in that type; the parameters, the sums over the steps
-    at the nodes, the heads and the outputs stay in float32.
+    ``precision`` may be changed at any time. With bf16 the products of the encoders and of message
+    passing are of numbers in that type, and on GPUs the latents of the edges are, too; the
+    parameters, the sums over the steps at the nodes, the heads and the outputs stay in float32.
     """
 
     def __init__(
@@ -128,8 +128,7 @@ class EncodeProcessDecode(nn.Module):
         self, node_features: Tensor, edge_features: Tensor | None, graph: Graph | None
     ) -> Prediction:
         """Predictions for ``node_features`` ``[N, :]`` and ``edge_features`` ``[E, :]``."""
-        exact = self.precision == "float32"
-        if exact and fused.applies(node_features) and not self.legacy_edges:
+        if fused.applies(node_features) and not self.legacy_edges:
             acceleration, *variances = fused.network(
                 self._perceptrons(),
                 node_features,
@@ -137,6 +136,7 @@ class EncodeProcessDecode(nn.Module):
                 graph,
                 heads=len(self._heads()),
                 alone=self.variance_alone,
+                bf16=self.precision == "bf16",
             )
         else:
             with self._autocast(node_features.device.type):

@@ -49,7 +49,15 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
       whose particles collapse into a pile, where every step costs the square of their number, is
       stopped, and its error is infinite from there.
     """
-    plain = replace(config, graph="base", unroll=1, mirror=False, drift=0.0, compression=0.0)
+    plain = replace(
+        config,
+        graph="base",
+        unroll=1,
+        variance_ahead=False,
+        mirror=False,
+        drift=0.0,
+        compression=0.0,
+    )
     windows = Windows(valid, simulator.metadata, plain, noise=0.0)
     numbers = np.linspace(0, len(windows) - 1, min(ONE_STEP_WINDOWS, len(windows)), dtype=int)
     losses, errors = [], []

@@ -405,6 +405,17 @@ def test_a_variance_ahead_learns_the_error_of_the_next_frame(
     )
 
 
+def test_training_with_a_variance_ahead_comes_to_its_end(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    """Through its validations, which look one frame ahead alone."""
+    config = replace(small_config, loss="decoupled", variance_ahead=True, unroll=2)
+    trainer(drops, tmp_path, config).run(QUIET)
+    last = read_checkpoint(tmp_path / LAST)
+    assert last.step == config.steps
+    assert last.validated
+
+
 def test_a_variance_ahead_needs_a_frame_ahead() -> None:
     with pytest.raises(ValueError, match=r"variance_ahead: needs the loss decoupled and unroll"):
         TrainConfig(loss="decoupled", variance_ahead=True, unroll=1)

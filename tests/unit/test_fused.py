@@ -254,6 +254,7 @@ EDGES = (np.zeros((1, 2), np.float32), INDEX)
         ({"edges": (EDGES[0], [*INDEX[:2], np.array([0, 2, 1])])}, ValueError, "offsets: .* rise"),
         ({"perceptrons": GOOD[:2]}, ValueError, "perceptrons: got 2, must be at least 2"),
         ({"perceptrons": GOOD[:3] + GOOD[4:]}, ValueError, "without its node perceptron"),
+        ({"perceptrons": [*GOOD[:3], [], *GOOD[4:]]}, ValueError, "a perceptron with no map"),
         ({"perceptrons": [*GOOD[:4], linear(2, 5)]}, ValueError, "a map of 5 inputs"),
         ({"perceptrons": [*GOOD[:4], linear(2, 4)[:1]]}, TypeError, "pairs of arrays"),
         ({"threads": 0}, ValueError, "threads: got 0"),

@@ -11,6 +11,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
+from adaptgns import fused
 from adaptgns.checkpoint import LAST, read_checkpoint
 from adaptgns.config import Precision, RolloutConfig, TrainConfig
 from adaptgns.rollout import write_rollouts
@@ -27,9 +28,14 @@ def off(values: Tensor, reference: Tensor) -> float:
 
 
 @pytest.mark.parametrize("with_edges", [True, False])
-def test_bf16_is_float32_within_its_rounding(with_edges: bool) -> None:
+@pytest.mark.parametrize("form", ["core", "torch"])
+def test_bf16_is_float32_within_its_rounding(
+    form: str, with_edges: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """bf16 rounds to 2^-9; three steps add up a few such errors in the outputs, and in the
     gradients, which go through them twice, some more."""
+    if form == "torch":
+        monkeypatch.setattr(fused, "applies", lambda _: False)
     case = Case(300, 2_000, latent=32, steps=3, with_edges=with_edges)
     outputs = 2
     exact = case.run()
@@ -46,7 +52,9 @@ def test_bf16_is_float32_within_its_rounding(with_edges: bool) -> None:
         assert off(one, other) < 0.15
 
 
-def test_only_edges_and_products_are_in_bf16() -> None:
+def test_only_edges_and_products_are_in_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In torch's form, which GPUs take."""
+    monkeypatch.setattr(fused, "applies", lambda _: False)
     case = Case()
     case.network.precision = "bf16"
     seen: dict[str, tuple[torch.dtype, ...]] = {}

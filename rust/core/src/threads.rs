@@ -184,12 +184,15 @@ impl Team {
         }
     }
 
-    /// `task` of every item, in the order of the items, computed by the whole team.
+    /// `task` of every item, in the order of the items, computed by the whole team. It returns only
+    /// after every task has, so that what these write may be taken as written; should one panic, so
+    /// does this.
     pub fn map<I: Send, R: Send>(&self, items: Vec<I>, task: impl Fn(I) -> R + Sync) -> Vec<R> {
         if !self.helped || items.len() < 2 {
             return items.into_iter().map(task).collect();
         }
-        let finished = Mutex::new(Vec::with_capacity(items.len()));
+        let count = items.len();
+        let finished = Mutex::new(Vec::with_capacity(count));
         let waiting = Mutex::new(items.into_iter().enumerate());
         self.all(&|| {
             let mut mine = Vec::new();
@@ -201,6 +204,7 @@ impl Team {
             lock(&finished).append(&mut mine);
         });
         let mut results = std::mem::take(&mut *lock(&finished));
+        assert_eq!(results.len(), count, "a task panicked on another thread");
         results.sort_unstable_by_key(|&(i, _)| i);
         results.into_iter().map(|(_, result)| result).collect()
     }
@@ -280,8 +284,8 @@ impl<F: FnMut()> Drop for OnDrop<F> {
     }
 }
 
-/// Locks; what a panicking thread held is as good as ever, and its panic surfaces when
-/// the scope ends.
+/// Locks; what a panicking thread held is as good as ever. Its panic surfaces when the scope ends,
+/// and before that nothing takes what it was to make for made.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -342,6 +346,27 @@ mod tests {
             team(Threads::All, |team| team.map(vec![1, 2, 3], |x| 2 * x)),
             [2, 4, 6]
         );
+    }
+
+    #[test]
+    fn nothing_goes_on_without_what_a_helper_did_not_make() {
+        let (panicked, went_on) = (AtomicBool::new(false), AtomicBool::new(false));
+        let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            team(Threads::All, |team| {
+                let owner = std::thread::current().id();
+                team.map((0..200).collect(), |_: i32| {
+                    if std::thread::current().id() != owner {
+                        panicked.store(true, Ordering::SeqCst);
+                        panic!("on a helper");
+                    }
+                    std::thread::sleep(std::time::Duration::from_millis(1));
+                });
+                went_on.store(true, Ordering::SeqCst);
+            });
+        }));
+        let panicked = panicked.into_inner(); // not where there is one core
+        assert_eq!(result.is_err(), panicked);
+        assert_eq!(went_on.into_inner(), !panicked);
     }
 
     #[test]

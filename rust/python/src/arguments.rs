@@ -55,12 +55,15 @@ pub fn offsets<'py>(
     array(argument, value, 1)?.ok_or_else(|| wrong_kind(argument, value, "a numpy array of int64"))
 }
 
-/// A bool vector.
-pub fn flags<'py>(
-    argument: &str,
-    value: &Bound<'py, PyAny>,
-) -> PyResult<PyReadonlyArrayDyn<'py, bool>> {
-    array(argument, value, 1)?.ok_or_else(|| wrong_kind(argument, value, "a numpy array of bool"))
+/// A bool vector. What numpy takes for true may be any byte but 0, as in a view of an image mask.
+pub fn flags(argument: &str, value: &Bound<'_, PyAny>) -> PyResult<Vec<bool>> {
+    if value.cast::<PyArrayDyn<bool>>().is_err() {
+        return Err(wrong_kind(argument, value, "a numpy array of bool"));
+    }
+    let bytes = value.call_method1("view", ("uint8",))?;
+    let bytes = array::<u8>(argument, &bytes, 1)?
+        .ok_or_else(|| wrong_kind(argument, value, "a numpy array of bool"))?;
+    Ok(bytes.as_slice()?.iter().map(|&byte| byte != 0).collect())
 }
 
 /// A finite sequence of numbers: a list, a tuple, a vector.

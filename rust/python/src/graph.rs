@@ -154,10 +154,7 @@ fn adaptive_graph<'py>(
     let eligible = eligible
         .map(|value| arguments::flags("eligible", value))
         .transpose()?;
-    let eligible = eligible
-        .as_ref()
-        .map(|array| array.as_slice())
-        .transpose()?;
+    let eligible = eligible.as_deref();
     with_slice!(&common.pos, pos => with_slice!(&sigma, sigma => {
         let expansion = Expansion { sigma, tau, factor, eligible };
         common.build(pos, |p, o| graph::adaptive_graph(p, r, &expansion, o))

@@ -1,7 +1,7 @@
 //! The graph network on the CPU: arrays in, arrays out.
 
 use adaptgns_core::Error;
-use adaptgns_core::network::{Edges, Features, Layer, Linear, Mlp, Network, Norm, Tape};
+use adaptgns_core::network::{Edges, Features, Layer, Linear, Mlp, Network, Norm, Precision, Tape};
 use adaptgns_core::threads::Threads;
 use numpy::prelude::*;
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayDyn, PyReadonlyArrayDyn};
@@ -24,6 +24,7 @@ struct Arguments<'py> {
     nodes: Reals<'py>,
     edges: Option<(Reals<'py>, Vec<Integers<'py>>)>,
     heads: usize,
+    bf16: bool,
     threads: Threads,
 }
 
@@ -33,6 +34,7 @@ impl<'py> Arguments<'py> {
         nodes: &Bound<'py, PyAny>,
         edges: Option<(Bound<'py, PyAny>, Vec<Bound<'py, PyAny>>)>,
         heads: usize,
+        bf16: bool,
         threads: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Self> {
         let perceptrons = perceptrons
@@ -61,6 +63,7 @@ impl<'py> Arguments<'py> {
             nodes: reals("node_features", nodes)?,
             edges,
             heads,
+            bf16,
             threads: arguments::threads(threads)?,
         })
     }
@@ -95,13 +98,20 @@ impl<'py> Arguments<'py> {
 
     /// Encoders, steps and heads in the order in which the parameters come.
     fn network(&self) -> PyResult<Network<'_>> {
-        let mut perceptrons = self
-            .perceptrons
-            .iter()
-            .map(|arrays| perceptron(arrays))
+        let first_head = self.perceptrons.len().saturating_sub(self.heads);
+        let mut perceptrons = (self.perceptrons.iter().enumerate())
+            .map(|(number, arrays)| {
+                let rounded = self.bf16 && number < first_head;
+                let precision = if rounded {
+                    Precision::Bf16
+                } else {
+                    Precision::Float32
+                };
+                perceptron(arrays, precision)
+            })
             .collect::<PyResult<Vec<_>>>()?;
         let encoders = 1 + usize::from(self.edges.is_some());
-        if perceptrons.len() < encoders + self.heads {
+        if perceptrons.len() < encoders.saturating_add(self.heads) {
             return Err(invalid(format!(
                 "got {}, must be at least {encoders} encoders and {} heads",
                 perceptrons.len(),
@@ -169,7 +179,7 @@ fn check_rows(argument: &str, rows: &Reals<'_>, encoder: Option<&Vec<Reals<'_>>>
 }
 
 /// Weights and biases in turn, then perhaps scale and shift.
-fn perceptron<'a>(arrays: &'a [Reals<'_>]) -> PyResult<Mlp<'a>> {
+fn perceptron<'a>(arrays: &'a [Reals<'_>], precision: Precision) -> PyResult<Mlp<'a>> {
     let (pairs, rest) = arrays.as_chunks::<2>();
     let mut mlp = Mlp {
         linears: Vec::new(),
@@ -185,7 +195,8 @@ fn perceptron<'a>(arrays: &'a [Reals<'_>]) -> PyResult<Mlp<'a>> {
                     second_slice.len()
                 )));
             }
-            mlp.linears.push(Linear::new(first_slice, second_slice));
+            mlp.linears
+                .push(Linear::new(first_slice, second_slice, precision));
         } else {
             mlp.norm = Some(Norm {
                 scale: first_slice,
@@ -206,7 +217,8 @@ type Heads<'py> = Vec<Bound<'py, PyArray2<f32>>>;
 
 /// Heads' outputs, and with `keep` the tape; `_core.pyi` has the whole contract.
 #[pyfunction]
-#[pyo3(signature = (perceptrons, node_features, edges, *, heads, keep, threads = None))]
+#[expect(clippy::too_many_arguments, reason = "keyword arguments in Python")]
+#[pyo3(signature = (perceptrons, node_features, edges, *, heads, keep, bf16 = false, threads = None))]
 fn network_forward<'py>(
     py: Python<'py>,
     perceptrons: &Bound<'py, PyAny>,
@@ -214,9 +226,10 @@ fn network_forward<'py>(
     edges: Option<(Bound<'py, PyAny>, Vec<Bound<'py, PyAny>>)>,
     heads: usize,
     keep: bool,
+    bf16: bool,
     threads: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<(Heads<'py>, Option<NetworkTape>)> {
-    let arguments = Arguments::new(perceptrons, node_features, edges, heads, threads)?;
+    let arguments = Arguments::new(perceptrons, node_features, edges, heads, bf16, threads)?;
     let (network, features) = (arguments.network()?, arguments.features()?);
     let threads = arguments.threads;
     let widths: Vec<usize> = network.heads.iter().map(Mlp::outputs).collect();
@@ -241,7 +254,7 @@ type PythonGradients<'py> = (
 /// Gradients by the parameters and the features; `_core.pyi` has the whole contract.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "keyword arguments in Python")]
-#[pyo3(signature = (perceptrons, node_features, edges, tape, gradients, *, alone = false, threads = None))]
+#[pyo3(signature = (perceptrons, node_features, edges, tape, gradients, *, alone = false, bf16 = false, threads = None))]
 fn network_backward<'py>(
     py: Python<'py>,
     perceptrons: &Bound<'py, PyAny>,
@@ -250,9 +263,11 @@ fn network_backward<'py>(
     tape: &NetworkTape,
     gradients: Vec<Bound<'py, PyAny>>,
     alone: bool,
+    bf16: bool,
     threads: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<PythonGradients<'py>> {
-    let arguments = Arguments::new(perceptrons, node_features, edges, gradients.len(), threads)?;
+    let heads = gradients.len();
+    let arguments = Arguments::new(perceptrons, node_features, edges, heads, bf16, threads)?;
     let (network, features) = (arguments.network()?, arguments.features()?);
     let gradients = (gradients.iter())
         .map(|array| reals("gradients", array))

@@ -80,7 +80,8 @@ const TASK: usize = 4096;
 /// `particles`, sorted by receiver.
 ///
 /// # Safety
-/// The parts name every particle once.
+/// The parts name every particle once, each part as many as it has rows; in a row no sender, which
+/// all are particles, comes twice, and with `drop_self` the receiver is one of them.
 pub(super) unsafe fn assemble(
     particles: usize,
     parts: Vec<(&[i32], &Rows)>,
@@ -92,6 +93,7 @@ pub(super) unsafe fn assemble(
     let mut rows: Vec<&[i32]> = room(particles);
     let places = Places::of(&mut rows.spare_capacity_mut()[..particles]);
     team.map(parts, |(receivers, part)| {
+        assert_eq!(receivers.len(), part.counts.len());
         let mut senders = &part.senders[..];
         for (&receiver, &count) in receivers.iter().zip(&part.counts) {
             let count = count as usize;
@@ -148,7 +150,7 @@ struct Writing<'a> {
     first: i32,
     first_edge: usize,
     rows: &'a [&'a [i32]],
-    /// As many, or one more.
+    /// At least as many.
     offsets: &'a mut [MaybeUninit<i64>],
     drop_self: bool,
     senders: &'a mut [MaybeUninit<i64>],

@@ -99,7 +99,7 @@ impl<'a, T> Places<'a, T> {
     }
 
     /// # Safety
-    /// No other thread writes to this place.
+    /// No other thread writes to this place, and nobody reads there meanwhile.
     pub unsafe fn write(&self, at: usize, value: T) {
         self.0[at].set(MaybeUninit::new(value));
     }

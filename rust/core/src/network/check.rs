@@ -158,6 +158,9 @@ fn check_offsets(
 
 /// Whether the maps fit one behind the other, and the first one `inputs` where they are given.
 fn check_mlp(mlp: &Mlp<'_>, inputs: Option<usize>) -> Result<(), Error> {
+    require(!mlp.linears.is_empty(), "perceptrons", || {
+        "got a perceptron with no map".into()
+    })?;
     let mut width = inputs;
     for linear in &mlp.linears {
         let (weights, outputs) = (linear.weight.len(), linear.outputs());
@@ -178,9 +181,6 @@ fn check_mlp(mlp: &Mlp<'_>, inputs: Option<usize>) -> Result<(), Error> {
         )?;
         width = Some(outputs);
     }
-    require(width.is_some(), "perceptrons", || {
-        "got a perceptron with no map".into()
-    })?;
     let normed = mlp
         .norm
         .is_none_or(|norm| norm.scale.len() == mlp.outputs() && norm.shift.len() == mlp.outputs());

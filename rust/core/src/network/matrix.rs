@@ -27,9 +27,9 @@ impl<'a> Matrix<'a> {
 
     /// The columns from `first` to `first + count`.
     pub fn columns(self, first: usize, count: usize) -> Self {
-        assert!(first + count <= self.columns && self.column_stride == 1);
+        assert!(first + count <= self.columns);
         Self {
-            data: self.data.get(first..).unwrap_or_default(),
+            data: (self.data.get(first * self.column_stride..)).unwrap_or_default(),
             columns: count,
             ..self
         }
@@ -53,6 +53,46 @@ impl<'a> Matrix<'a> {
             row_stride: self.column_stride,
             column_stride: self.row_stride,
             ..self
+        }
+    }
+
+    /// How many rows and columns.
+    pub fn size(&self) -> (usize, usize) {
+        (self.rows, self.columns)
+    }
+
+    /// How far rows are apart, and columns.
+    pub fn strides(&self) -> (usize, usize) {
+        (self.row_stride, self.column_stride)
+    }
+
+    /// All numbers from the first to the last, as they lie.
+    pub fn numbers(&self) -> &'a [f32] {
+        &self.data[..self.extent()]
+    }
+
+    /// The same of other numbers that lie as its own do.
+    pub fn with(self, numbers: &[f32]) -> Matrix<'_> {
+        assert_eq!(numbers.len(), self.extent());
+        Matrix {
+            data: numbers,
+            ..self
+        }
+    }
+
+    /// Copies them to the rows of `out`, `stride` apart: square by square, since of rows and
+    /// columns one lies across the lines of the cache.
+    pub fn copy_to(&self, out: &mut [f32], stride: usize) {
+        const SQUARE: usize = 16;
+        for row in (0..self.rows).step_by(SQUARE) {
+            for column in (0..self.columns).step_by(SQUARE) {
+                for i in row..self.rows.min(row + SQUARE) {
+                    for j in column..self.columns.min(column + SQUARE) {
+                        out[i * stride + j] =
+                            self.data[i * self.row_stride + j * self.column_stride];
+                    }
+                }
+            }
         }
     }
 
@@ -129,6 +169,7 @@ fn tiles<V: Vector, const R: usize, const C: usize>(
     if rows == 0 || columns == 0 {
         return;
     }
+    assert!(a.columns > 0, "nothing to sum");
     assert!(a.extent() <= a.data.len() && b.extent() <= b.data.len() && b.column_stride == 1);
     let extent = (rows - 1) * stride + columns;
     assert!(columns <= stride && extent <= out.len());

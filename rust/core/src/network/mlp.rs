@@ -1,17 +1,39 @@
 //! Perceptrons over blocks of rows: all layers of a block while it lies in the cache.
 
+use std::ops::{DerefMut, Range};
+use std::sync::OnceLock;
+
+#[cfg(target_arch = "x86_64")]
+use super::amx::Tiles;
+use super::bf16::{self, Right};
 use super::buffer::Buffer;
 use super::matrix::{End, Matrix, Start, product};
 use super::rows;
-use std::ops::DerefMut;
-use std::sync::OnceLock;
+
+/// What the factors of a map's products are rounded to; sums are in float32.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Precision {
+    /// Nothing.
+    Float32,
+    /// 8 bits of significand.
+    Bf16,
+}
 
 /// A linear map: `weight` row-major `[outputs, inputs]` and `bias` `[outputs]`.
 pub struct Linear<'a> {
     pub(super) weight: &'a [f32],
     bias: &'a [f32],
-    forward: OnceLock<Buffer>,
-    backward: OnceLock<Buffer>,
+    precision: Precision,
+    forward: Copies,
+    backward: Copies,
+}
+
+/// What a weight is copied to for products, once it is asked for.
+#[derive(Default)]
+struct Copies {
+    numbers: OnceLock<Buffer>,
+    #[cfg(target_arch = "x86_64")]
+    tiles: OnceLock<Tiles>,
 }
 
 /// Numbers behind each row of a copied weight, so that a column's do not all fall into the same
@@ -20,13 +42,13 @@ const GAP: usize = 16;
 
 impl<'a> Linear<'a> {
     /// One row of `weight` and one number of `bias` per output.
-    pub fn new(weight: &'a [f32], bias: &'a [f32]) -> Self {
-        let (forward, backward) = (OnceLock::new(), OnceLock::new());
+    pub fn new(weight: &'a [f32], bias: &'a [f32], precision: Precision) -> Self {
         Self {
             weight,
             bias,
-            forward,
-            backward,
+            precision,
+            forward: Copies::default(),
+            backward: Copies::default(),
         }
     }
 
@@ -39,36 +61,114 @@ impl<'a> Linear<'a> {
     }
 
     /// `[inputs, outputs]`, what rows are multiplied with on their way forward.
-    pub(super) fn forward(&self) -> Matrix<'_> {
-        let (inputs, outputs) = (self.inputs(), self.outputs());
-        let stride = outputs + GAP;
-        let data = self.forward.get_or_init(|| {
-            let mut data = Buffer::any(inputs * stride);
-            for (o, row) in self.weight.chunks_exact(inputs).enumerate() {
-                for (i, &x) in row.iter().enumerate() {
-                    data[i * stride + o] = x;
-                }
-            }
-            data
-        });
-        Matrix::new(data, stride).columns(0, outputs)
+    pub(super) fn forward(&self) -> Factor<'_> {
+        Factor {
+            weight: Matrix::new(self.weight, self.inputs()).transposed(),
+            precision: self.precision,
+            copies: &self.forward,
+            rows: 0..self.inputs(),
+            columns: 0..self.outputs(),
+        }
     }
 
     /// `[outputs, inputs]`, what gradients are multiplied with on their way back.
-    fn backward(&self) -> Matrix<'_> {
-        let inputs = self.inputs();
-        let stride = inputs + GAP;
-        let data = self.backward.get_or_init(|| {
-            let mut data = Buffer::any(self.outputs() * stride);
-            for (copy, row) in data
-                .chunks_exact_mut(stride)
-                .zip(self.weight.chunks_exact(inputs))
-            {
-                copy[..inputs].copy_from_slice(row);
+    fn backward(&self) -> Factor<'_> {
+        Factor {
+            weight: Matrix::new(self.weight, self.inputs()),
+            precision: self.precision,
+            copies: &self.backward,
+            rows: 0..self.outputs(),
+            columns: 0..self.inputs(),
+        }
+    }
+
+    /// Adds to rows of `out`, `stride` apart, the product of `outer` and `inner`, of rows that met
+    /// the map and gradients of what came out.
+    pub(super) fn add_product(
+        &self,
+        out: &mut [f32],
+        stride: usize,
+        outer: Matrix<'_>,
+        inner: Matrix<'_>,
+    ) {
+        match self.precision {
+            Precision::Float32 => product(out, stride, Start::There, outer, inner, End::Whole),
+            Precision::Bf16 => {
+                let inner = Right::Fresh(inner);
+                bf16::product(out, stride, Start::There, outer, inner, End::Whole);
+            }
+        }
+    }
+}
+
+/// Some rows and columns of a weight, as the right factor of products.
+pub(super) struct Factor<'l> {
+    weight: Matrix<'l>,
+    precision: Precision,
+    copies: &'l Copies,
+    rows: Range<usize>,
+    columns: Range<usize>,
+}
+
+impl Factor<'_> {
+    /// The rows from `first` to `first + count`.
+    pub fn rows(self, first: usize, count: usize) -> Self {
+        let rows = first..first + count;
+        Self { rows, ..self }
+    }
+
+    /// The columns from `first` to `first + count`.
+    fn columns(self, first: usize, count: usize) -> Self {
+        let columns = first..first + count;
+        Self { columns, ..self }
+    }
+
+    /// `out`, of rows `stride` apart, becomes `start` plus the product of `a` and this, and then
+    /// what `end` says.
+    pub fn product(
+        &self,
+        out: &mut [f32],
+        stride: usize,
+        start: Start<'_>,
+        a: Matrix<'_>,
+        end: End<'_>,
+    ) {
+        match self.precision {
+            Precision::Float32 => product(out, stride, start, a, self.numbers(), end),
+            Precision::Bf16 => bf16::product(out, stride, start, a, self.rounded(), end),
+        }
+    }
+
+    fn rounded(&self) -> Right<'_> {
+        #[cfg(target_arch = "x86_64")]
+        if rows::processor() == rows::Processor::Amx {
+            let tiles = (self.copies.tiles).get_or_init(|| Tiles::of_right(self.weight));
+            if let Some(part) = tiles.part(
+                self.rows.clone(),
+                self.columns.clone(),
+                self.weight.size().0,
+            ) {
+                return Right::Tiles(part);
+            }
+        }
+        Right::Rounded(self.numbers())
+    }
+
+    /// Copied with a gap behind each row, and rounded to what they are multiplied in.
+    fn numbers(&self) -> Matrix<'_> {
+        let (rows, columns) = self.weight.size();
+        let stride = columns + GAP;
+        let data = self.copies.numbers.get_or_init(|| {
+            let mut data = Buffer::any(rows * stride);
+            self.weight.copy_to(&mut data, stride);
+            if self.precision == Precision::Bf16 {
+                bf16::round(&mut data);
             }
             data
         });
-        Matrix::new(data, stride).columns(0, inputs)
+        Matrix::new(data, stride)
+            .rows(self.rows.start, self.rows.len())
+            .columns(self.columns.start, self.columns.len())
     }
 }
 
@@ -177,13 +277,13 @@ impl<'a> Mlp<'a> {
                     let weight = linear.forward().rows(input.column, input.width);
                     let whole = number + 1 == inputs.len();
                     let end = if whole { end } else { End::Whole };
-                    product(target, outputs, start, rows, weight, end);
+                    weight.product(target, outputs, start, rows, end);
                     start = Start::There;
                 }
             } else {
                 let rows = Matrix::new(before[i - 1], linear.inputs());
                 let start = Start::Row(linear.bias);
-                product(target, outputs, start, rows, linear.forward(), end);
+                (linear.forward()).product(target, outputs, start, rows, end);
             }
         }
         if let Some(norm) = self.norm {
@@ -237,30 +337,16 @@ impl<'a> Mlp<'a> {
                 for input in inputs {
                     let inner = Matrix::new(input.rows, input.width);
                     let target = &mut to_weight[input.column..];
-                    product(
-                        target,
-                        columns,
-                        Start::There,
-                        outer.transposed(),
-                        inner,
-                        End::Whole,
-                    );
+                    linear.add_product(target, columns, outer.transposed(), inner);
                 }
                 break;
             }
             let activation = &*kept.hidden[i - 1];
             let inner = Matrix::new(activation, columns);
-            product(
-                to_weight,
-                columns,
-                Start::There,
-                outer.transposed(),
-                inner,
-                End::Whole,
-            );
+            linear.add_product(to_weight, columns, outer.transposed(), inner);
             let before = &mut spare[..rows * columns];
             let end = End::WherePositive(activation);
-            product(before, columns, Start::Zero, outer, linear.backward(), end);
+            (linear.backward()).product(before, columns, Start::Zero, outer, end);
             (gradient, spare) = (spare, gradient);
         }
         &gradient[..rows * self.linears[0].outputs()]
@@ -278,7 +364,7 @@ impl<'a> Mlp<'a> {
         let first = &self.linears[0];
         let weight = first.backward().columns(column, width);
         let outer = Matrix::new(gradient, first.outputs());
-        product(out, width, Start::There, outer, weight, End::Whole);
+        weight.product(out, width, Start::There, outer, End::Whole);
     }
 }
 

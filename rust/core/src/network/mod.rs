@@ -1,5 +1,5 @@
-//! The encode-process-decode graph network (Sanchez-Gonzalez et al. 2020) in float32 on the CPU,
-//! forward and backward.
+//! The encode-process-decode graph network (Sanchez-Gonzalez et al. 2020) on the CPU, in float32 or
+//! with products in bf16, forward and backward.
 //!
 //! Rows (nodes or edges) go through all layers of a perceptron block by block, while the block
 //! lies in the cache. The first map of an edge's perceptron acts on [receiver, sender, edge]; its
@@ -12,6 +12,9 @@
 //! undoing one residual after the other, so a step keeps none but the last. What rounding that adds is below
 //! that of the passes themselves, unless LayerNorms scale by a thousand.
 
+#[cfg(target_arch = "x86_64")]
+mod amx;
+mod bf16;
 mod buffer;
 mod check;
 mod matrix;
@@ -21,11 +24,11 @@ mod vector;
 
 use std::ops::Range;
 
-pub use mlp::{Linear, Mlp, Norm};
+pub use mlp::{Linear, Mlp, Norm, Precision};
 
 use crate::threads::{self, Team, Threads};
 use buffer::Buffer;
-use matrix::{End, Matrix, Start, product};
+use matrix::{End, Matrix, Start};
 use mlp::{Input, Kept, KeptMut, split};
 
 /// Rows that go through a perceptron at once.
@@ -601,7 +604,7 @@ impl Pass<'_> {
     /// the edges it receives, then what it gives to those it sends.
     fn project(&self, mlp: &Mlp<'_>, nodes: &[f32], width: usize) -> Buffer {
         let mut out = Buffer::any(2 * nodes.len());
-        let first = mlp.linears[0].forward();
+        let first = &mlp.linears[0];
         let items: Vec<_> = starts(self.lengths)
             .zip(split(&mut out, self.lengths, self.rows))
             .collect();
@@ -609,9 +612,9 @@ impl Pass<'_> {
             let count = out.len() / (2 * width);
             let nodes = Matrix::new(&nodes[start * width..(start + count) * width], width);
             for end in 0..2 {
-                let weight = first.rows(end * width, width);
+                let weight = first.forward().rows(end * width, width);
                 let out = out.get_mut(end * width..).unwrap_or_default();
-                product(out, 2 * width, Start::Zero, nodes, weight, End::Whole);
+                weight.product(out, 2 * width, Start::Zero, nodes, End::Whole);
             }
         });
         out
@@ -707,14 +710,7 @@ impl Pass<'_> {
                 .enumerate()
             {
                 let outer = Matrix::new(gradient, width).transposed();
-                product(
-                    &mut sum[end * width..],
-                    columns,
-                    Start::There,
-                    outer,
-                    inner,
-                    End::Whole,
-                );
+                mlp.linears[0].add_product(&mut sum[end * width..], columns, outer, inner);
                 mlp.add_input_gradient(gradient, end * width, width, to_nodes);
             }
             sum
@@ -853,6 +849,7 @@ fn total<I: Send>(
 mod tests {
     use proptest::prelude::*;
 
+    use super::bf16::Right;
     use super::rows::{MOST, Processor};
     use super::*;
 
@@ -869,18 +866,64 @@ mod tests {
             .collect()
     }
 
-    proptest! {
-        #[test]
-        fn products_are_sums_of_products(
-            rows in 0usize..21, inner in 0usize..9, columns in 1usize..75, gap in 0usize..3,
-            transposed: bool, start in 0usize..3, end in 0usize..3, kind in 0usize..3, seed: u64,
-        ) {
-            let most = [Processor::Plain, Processor::V3, Processor::V4][kind];
-            MOST.set(most);
-            let left = numbers(seed, rows * inner);
-            let right = numbers(seed ^ 1, inner * columns);
+    const PROCESSORS: [Processor; 4] = [
+        Processor::Plain,
+        Processor::V3,
+        Processor::V4,
+        Processor::Amx,
+    ];
+
+    /// A product and all that it is made of.
+    #[derive(Debug)]
+    struct Case {
+        rows: usize,
+        inner: usize,
+        columns: usize,
+        gap: usize,
+        transposed: bool,
+        start: usize,
+        end: usize,
+        seed: u64,
+    }
+
+    fn cases(rows: usize, inner: usize, columns: usize) -> impl Strategy<Value = Case> {
+        let sizes = (0..rows, 0..inner, 1..columns, 0usize..3);
+        let how = (any::<bool>(), 0usize..3, 0usize..3, any::<u64>());
+        (sizes, how).prop_map(
+            |((rows, inner, columns, gap), (transposed, start, end, seed))| Case {
+                rows,
+                inner,
+                columns,
+                gap,
+                transposed,
+                start,
+                end,
+                seed,
+            },
+        )
+    }
+
+    impl Case {
+        /// What `product` gives is what it should, of factors that `round` has gone over, to
+        /// `error`.
+        fn check(
+            &self,
+            product: fn(&mut [f32], usize, Start<'_>, Matrix<'_>, Matrix<'_>, End<'_>),
+            round: fn(&mut [f32]),
+            error: f64,
+        ) -> Result<(), TestCaseError> {
+            let &Self {
+                rows,
+                inner,
+                columns,
+                transposed,
+                seed,
+                ..
+            } = self;
+            let mut left = numbers(seed, rows * inner);
+            let mut right = numbers(seed ^ 1, inner * columns);
             let row = numbers(seed ^ 2, columns);
-            let stride = columns + gap;
+            let stride = columns + self.gap;
             let before = numbers(seed ^ 3, rows * stride);
             let mut out = before.clone();
             let a = if transposed {
@@ -888,12 +931,21 @@ mod tests {
             } else {
                 Matrix::new(&left, inner.max(1))
             };
-            let start = [Start::There, Start::Zero, Start::Row(&row)][start];
+            let start = [Start::There, Start::Zero, Start::Row(&row)][self.start];
             let like = numbers(seed ^ 4, rows * stride);
-            let end = [End::Whole, End::Relu, End::WherePositive(&like)][end];
+            let end = [End::Whole, End::Relu, End::WherePositive(&like)][self.end];
             if rows > 0 && inner > 0 {
-                product(&mut out, stride, start, a, Matrix::new(&right, columns), end);
+                product(
+                    &mut out,
+                    stride,
+                    start,
+                    a,
+                    Matrix::new(&right, columns),
+                    end,
+                );
             }
+            round(&mut left);
+            round(&mut right);
             for i in 0..rows {
                 for j in 0..stride {
                     let was = f64::from(before[i * stride + j]);
@@ -905,7 +957,11 @@ mod tests {
                             Start::Row(row) => f64::from(row[j]),
                         };
                         for k in 0..inner {
-                            let place = if transposed { k * rows + i } else { i * inner + k };
+                            let place = if transposed {
+                                k * rows + i
+                            } else {
+                                i * inner + k
+                            };
                             expected += f64::from(left[place]) * f64::from(right[k * columns + j]);
                         }
                         expected = match end {
@@ -915,33 +971,176 @@ mod tests {
                             End::WherePositive(_) => 0.0,
                         };
                     }
-                    prop_assert!((f64::from(out[i * stride + j]) - expected).abs() < 1e-5);
+                    prop_assert!((f64::from(out[i * stride + j]) - expected).abs() < error);
                 }
             }
-            MOST.set(Processor::V4);
+            Ok(())
         }
+    }
+
+    proptest! {
+        #[test]
+        fn products_are_sums_of_products(case in cases(21, 9, 75), kind in 0usize..3) {
+            MOST.set(PROCESSORS[kind]);
+            case.check(matrix::product, |_| {}, 1e-5)?;
+            MOST.set(Processor::Amx);
+        }
+
+        #[test]
+        fn products_in_bf16_are_those_of_rounded_numbers(
+            case in cases(140, 90, 75), kind in 0usize..4,
+        ) {
+            MOST.set(PROCESSORS[kind]);
+            case.check(
+                |out, stride, start, a, b, end| {
+                    bf16::product(out, stride, start, a, Right::Fresh(b), end);
+                },
+                bf16::round,
+                2e-5,
+            )?;
+            MOST.set(Processor::Amx);
+        }
+    }
+
+    /// More of the inner size than is packed at once.
+    #[test]
+    fn long_sums_in_bf16() {
+        let case = |transposed| Case {
+            rows: 35,
+            inner: 1_100,
+            columns: 20,
+            gap: 1,
+            transposed,
+            start: 2,
+            end: 1,
+            seed: 5,
+        };
+        for kind in PROCESSORS {
+            MOST.set(kind);
+            for transposed in [false, true] {
+                let product = |out: &mut _,
+                               stride,
+                               start: Start<'_>,
+                               a: Matrix<'_>,
+                               b: Matrix<'_>,
+                               end: End<'_>| {
+                    bf16::product(out, stride, start, a, Right::Fresh(b), end);
+                };
+                case(transposed).check(product, bf16::round, 3e-4).unwrap();
+            }
+        }
+        MOST.set(Processor::Amx);
+    }
+
+    /// Some rows and columns of a weight, whether they begin with tiles or not.
+    #[test]
+    fn parts_of_weights_in_bf16() {
+        let (inputs, outputs) = (96, 40);
+        let mut weight = numbers(1, inputs * outputs);
+        let (bias, mut rows) = (vec![0.0; outputs], numbers(2, 5 * inputs));
+        for kind in PROCESSORS {
+            MOST.set(kind);
+            let linear = Linear::new(&weight, &bias, Precision::Bf16);
+            for (first, count) in [(0, 96), (32, 64), (64, 32), (32, 32), (20, 30), (64, 20)] {
+                let mut out = vec![0.0; 5 * outputs];
+                let part = Matrix::new(&rows, inputs).columns(first, count);
+                let factor = linear.forward().rows(first, count);
+                factor.product(&mut out, outputs, Start::Zero, part, End::Whole);
+                for i in 0..5 {
+                    for o in 0..outputs {
+                        let product = |k| {
+                            let mut pair = [rows[i * inputs + k], weight[o * inputs + k]];
+                            bf16::round(&mut pair);
+                            f64::from(pair[0]) * f64::from(pair[1])
+                        };
+                        let expected: f64 = (first..first + count).map(product).sum();
+                        let off = (f64::from(out[i * outputs + o]) - expected).abs();
+                        assert!(off < 2e-5, "{kind:?}, rows {first} to {}", first + count);
+                    }
+                }
+            }
+        }
+        MOST.set(Processor::Amx);
+        // Not only of numbers that are rounded.
+        assert!(
+            weight
+                .iter()
+                .chain(&rows)
+                .any(|x| x.to_bits() & 0xffff != 0)
+        );
+        bf16::round(&mut weight);
+        bf16::round(&mut rows);
+        assert!(
+            weight
+                .iter()
+                .chain(&rows)
+                .all(|x| x.to_bits() & 0xffff == 0)
+        );
+    }
+
+    #[test]
+    fn rounding_is_to_the_nearest_and_keeps_what_is_not_a_number() {
+        let mut values = [
+            1.0,
+            1.003_906_25,
+            1.011_718_75,
+            -1.005,
+            f32::INFINITY,
+            f32::MAX,
+        ];
+        bf16::round(&mut values);
+        assert_eq!(
+            values,
+            [
+                1.0,
+                1.0,
+                1.015_625,
+                -1.007_812_5,
+                f32::INFINITY,
+                f32::INFINITY
+            ]
+        );
+        let mut nan = [
+            f32::NAN,
+            -f32::NAN,
+            f32::from_bits(0x7fff_ffff),
+            f32::from_bits(0x7f80_0001),
+        ];
+        bf16::round(&mut nan);
+        assert!(nan.iter().all(|x| x.is_nan()), "{nan:?}");
     }
 
     #[test]
     fn nan_stays_and_is_not_positive() {
-        for most in [Processor::Plain, Processor::V3, Processor::V4] {
+        for most in PROCESSORS {
             MOST.set(most);
             for columns in [1, 8, 16, 32] {
                 let (nan, one) = (vec![f32::NAN; columns], [1.0]);
                 let (nans, ones) = (Matrix::new(&nan, columns), Matrix::new(&one, 1));
-                let mut out = vec![0.0; columns];
-                product(&mut out, columns, Start::Zero, ones, nans, End::Relu);
-                assert!(out.iter().all(|x| x.is_nan()), "{most:?}, {columns}");
-                let end = End::WherePositive(&nan);
-                product(&mut out, columns, Start::Row(&[1.0; 32]), ones, nans, end);
-                assert!(out.iter().all(|&x| x == 0.0), "{most:?}, {columns}");
+                let products: [fn(&mut [f32], usize, Start<'_>, Matrix<'_>, Matrix<'_>, End<'_>);
+                    2] = [matrix::product, |out, stride, start, a, b, end| {
+                    bf16::product(out, stride, start, a, Right::Fresh(b), end);
+                }];
+                for product in products {
+                    let mut out = vec![0.0; columns];
+                    product(&mut out, columns, Start::Zero, ones, nans, End::Relu);
+                    assert!(out.iter().all(|x| x.is_nan()), "{most:?}, {columns}");
+                    let end = End::WherePositive(&nan);
+                    product(&mut out, columns, Start::Row(&[1.0; 32]), ones, nans, end);
+                    assert!(out.iter().all(|&x| x == 0.0), "{most:?}, {columns}");
+                }
             }
-            MOST.set(Processor::V4);
+            MOST.set(Processor::Amx);
         }
     }
 
-    /// A network of two steps on a ring of `nodes`, and the sum of its head's outputs.
-    fn ring(nodes: usize, width: usize, threads: Threads) -> (Vec<f32>, Vec<f32>) {
+    /// Of a network of two steps on a ring of `nodes`, the outputs, and the gradients of their sum.
+    fn ring(
+        nodes: usize,
+        width: usize,
+        precision: Precision,
+        threads: Threads,
+    ) -> (Vec<f32>, Vec<f32>) {
         let ends: Vec<i64> = (0..nodes as i64).collect();
         let senders: Vec<i64> = ends.iter().map(|i| (i + 1) % nodes as i64).collect();
         let offsets: Vec<i64> = (0..=nodes as i64).collect();
@@ -975,8 +1174,8 @@ mod tests {
         let network = || {
             let mut mlps = data.iter().enumerate().map(|(i, data)| Mlp {
                 linears: vec![
-                    Linear::new(&data[0], &data[1]),
-                    Linear::new(&data[2], &data[3]),
+                    Linear::new(&data[0], &data[1], precision),
+                    Linear::new(&data[2], &data[3], precision),
                 ],
                 norm: (i < 6).then(|| Norm {
                     scale: &data[4],
@@ -1023,23 +1222,45 @@ mod tests {
     #[test]
     fn any_number_of_threads_gives_the_same_bits() {
         let one = Threads::AtMost(std::num::NonZeroUsize::MIN);
-        assert!(ring(1_000, 16, one) == ring(1_000, 16, Threads::All));
+        for precision in [Precision::Float32, Precision::Bf16] {
+            let run = |threads| ring(1_000, 32, precision, threads);
+            assert!(run(one) == run(Threads::All), "{precision:?}");
+        }
+    }
+
+    /// Of the sums of squares, how much two results differ.
+    fn difference(one: &[f32], other: &[f32]) -> f32 {
+        let norm = |values: &mut dyn Iterator<Item = f32>| values.map(|x| x * x).sum::<f32>();
+        let off = norm(&mut one.iter().zip(other).map(|(a, b)| a - b));
+        off / norm(&mut one.iter().copied())
     }
 
     #[test]
     fn every_kind_of_processor_gives_the_same() {
         let one = Threads::AtMost(std::num::NonZeroUsize::MIN);
-        let best = ring(300, 20, one);
-        for most in [Processor::Plain, Processor::V3] {
-            MOST.set(most);
-            let other = ring(300, 20, one);
-            MOST.set(Processor::V4);
-            for (best, other) in [(&best.0, &other.0), (&best.1, &other.1)] {
-                let norm =
-                    |values: &mut dyn Iterator<Item = f32>| values.map(|x| x * x).sum::<f32>();
-                let off = norm(&mut best.iter().zip(other).map(|(a, b)| a - b));
-                assert!(off < 1e-8 * norm(&mut best.iter().copied()), "{most:?}");
+        // What is rounded to bf16 may fall on either side of where sums end.
+        for (precision, error) in [(Precision::Float32, 1e-8), (Precision::Bf16, 1e-4)] {
+            for width in [20, 32] {
+                let best = ring(300, width, precision, one);
+                for most in PROCESSORS {
+                    MOST.set(most);
+                    let other = ring(300, width, precision, one);
+                    MOST.set(Processor::Amx);
+                    assert!(difference(&best.0, &other.0) < error, "{most:?}, {width}");
+                    assert!(difference(&best.1, &other.1) < error, "{most:?}, {width}");
+                }
             }
+        }
+    }
+
+    #[test]
+    fn bf16_is_float32_but_for_its_rounding() {
+        let one = Threads::AtMost(std::num::NonZeroUsize::MIN);
+        let [exact, rounded] =
+            [Precision::Float32, Precision::Bf16].map(|precision| ring(300, 32, precision, one));
+        for (exact, rounded) in [(&exact.0, &rounded.0), (&exact.1, &rounded.1)] {
+            let off = difference(exact, rounded);
+            assert!(1e-8 < off && off < 1e-3, "{off}");
         }
     }
 }

@@ -24,7 +24,8 @@ macro_rules! vectorized {
                 }
                 match $crate::network::rows::processor() {
                     // SAFETY: the processor has them.
-                    $crate::network::rows::Processor::V4 => return unsafe { v4($($argument),*) },
+                    $crate::network::rows::Processor::V4
+                    | $crate::network::rows::Processor::Amx => return unsafe { v4($($argument),*) },
                     // SAFETY: the processor has them.
                     $crate::network::rows::Processor::V3 => return unsafe { v3($($argument),*) },
                     $crate::network::rows::Processor::Plain => {}
@@ -38,18 +39,19 @@ macro_rules! vectorized {
 }
 pub(super) use vectorized;
 
-/// What a processor has, the least first: nothing that needs asking, AVX2 with FMA, AVX-512.
+/// What a processor has, the least first: nothing that needs asking, AVX2 with FMA, AVX-512, tiles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Processor {
     Plain,
     V3,
     V4,
+    Amx,
 }
 
 #[cfg(test)]
 thread_local! {
     /// The most that this thread uses of its processor.
-    pub(super) static MOST: std::cell::Cell<Processor> = const { std::cell::Cell::new(Processor::V4) };
+    pub(super) static MOST: std::cell::Cell<Processor> = const { std::cell::Cell::new(Processor::Amx) };
 }
 
 /// The processor at hand.
@@ -61,7 +63,9 @@ pub(super) fn processor() -> Processor {
         && is_x86_feature_detected!("avx512vl")
         && is_x86_feature_detected!("avx512bw")
         && is_x86_feature_detected!("avx512dq");
-    let most = if v4 {
+    let most = if v4 && super::amx::allowed() {
+        Processor::Amx
+    } else if v4 {
         Processor::V4
     } else if v3 {
         Processor::V3
