@@ -39,17 +39,6 @@ def both_directions(pairs: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 @EVERY
 @given(positions(), st.sampled_from([0.3, 1.0, 2.3]), st.booleans())
-def test_any_byte_but_0_makes_a_particle_eligible() -> None:
-    """numpy takes a view of an image mask, of 0 and 255, for the same as one of 0 and 1."""
-    rng = np.random.default_rng(0)
-    pos, sigma, mask = rng.random((500, 2)), rng.random(500), rng.random(500) < 0.1
-    expected = adaptive_graph(pos, sigma, 0.05, 60, 1.5, eligible=mask)
-    for byte in (2, 3, 255):
-        view = (mask * np.uint8(byte)).view(np.bool_)
-        found = adaptive_graph(pos, sigma, 0.05, 60, 1.5, eligible=view)
-        np.testing.assert_array_equal(found, expected)
-
-
 def test_radius_graph_equals_scipy(pos: Positions, r: float, periodic: bool) -> None:
     tree = cKDTree(pos.reshape(-1, pos.shape[1]), boxsize=8.0 if periodic else None)
     # Pairs within rounding of the radius may fall either way.
@@ -252,3 +241,14 @@ def test_the_core_needs_numpy_alone() -> None:
         "assert not {'torch', 'h5py', 'scipy', 'matplotlib'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_any_byte_but_0_makes_a_particle_eligible() -> None:
+    """numpy takes a view of an image mask, of 0 and 255, for the same as one of 0 and 1."""
+    rng = np.random.default_rng(0)
+    pos, sigma, mask = rng.random((500, 2)), rng.random(500), rng.random(500) < 0.1
+    expected = adaptive_graph(pos, sigma, 0.05, 60, 1.5, eligible=mask)
+    for byte in (2, 3, 255):
+        view = (mask * np.uint8(byte)).view(np.bool_)
+        found = adaptive_graph(pos, sigma, 0.05, 60, 1.5, eligible=view)
+        np.testing.assert_array_equal(found, expected)
