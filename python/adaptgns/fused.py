@@ -69,9 +69,7 @@ def network(
     inputs = [node_features, edge_features, *index, *flat]
     # Not what `forward` can see, where no gradients are taken and parameters ask for them anyway.
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
-    out: tuple[Tensor, ...] = _Network.apply(
-        len(index), sizes, heads, alone, bf16, keep, *inputs
-    )
+    out: tuple[Tensor, ...] = _Network.apply(len(index), sizes, heads, alone, bf16, keep, *inputs)
     return list(out)
 
 
