@@ -873,6 +873,8 @@ mod tests {
         Processor::Amx,
     ];
 
+    type Product = fn(&mut [f32], usize, Start<'_>, Matrix<'_>, Matrix<'_>, End<'_>);
+
     /// A product and all that it is made of.
     #[derive(Debug)]
     struct Case {
@@ -908,7 +910,7 @@ mod tests {
         /// `error`.
         fn check(
             &self,
-            product: fn(&mut [f32], usize, Start<'_>, Matrix<'_>, Matrix<'_>, End<'_>),
+            product: Product,
             round: fn(&mut [f32]),
             error: f64,
         ) -> Result<(), TestCaseError> {
@@ -1082,8 +1084,8 @@ mod tests {
     fn rounding_is_to_the_nearest_and_keeps_what_is_not_a_number() {
         let mut values = [
             1.0,
-            1.003_906_25,
-            1.011_718_75,
+            1.0 + 1.0 / 256.0,
+            1.0 + 3.0 / 256.0,
             -1.005,
             f32::INFINITY,
             f32::MAX,
@@ -1117,8 +1119,7 @@ mod tests {
             for columns in [1, 8, 16, 32] {
                 let (nan, one) = (vec![f32::NAN; columns], [1.0]);
                 let (nans, ones) = (Matrix::new(&nan, columns), Matrix::new(&one, 1));
-                let products: [fn(&mut [f32], usize, Start<'_>, Matrix<'_>, Matrix<'_>, End<'_>);
-                    2] = [matrix::product, |out, stride, start, a, b, end| {
+                let products: [Product; 2] = [matrix::product, |out, stride, start, a, b, end| {
                     bf16::product(out, stride, start, a, Right::Fresh(b), end);
                 }];
                 for product in products {

@@ -22,13 +22,15 @@ macro_rules! vectorized {
                     type Lanes = std::arch::x86_64::__m256;
                     $body
                 }
+                use $crate::network::rows::Processor;
                 match $crate::network::rows::processor() {
+                    Processor::V4 | Processor::Amx => {
+                        // SAFETY: the processor has them.
+                        return unsafe { v4($($argument),*) };
+                    }
                     // SAFETY: the processor has them.
-                    $crate::network::rows::Processor::V4
-                    | $crate::network::rows::Processor::Amx => return unsafe { v4($($argument),*) },
-                    // SAFETY: the processor has them.
-                    $crate::network::rows::Processor::V3 => return unsafe { v3($($argument),*) },
-                    $crate::network::rows::Processor::Plain => {}
+                    Processor::V3 => return unsafe { v3($($argument),*) },
+                    Processor::Plain => {}
                 }
             }
             #[allow(dead_code, reason = "not every body names it")]
