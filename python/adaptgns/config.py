@@ -147,7 +147,8 @@ class RolloutConfig:
     device: Device = "auto"
     """auto: a GPU where there is one."""
     precision: Precision = "float32"
-    """bf16: the message passing in 16 bits, everything around it in 32; for large networks."""
+    """bf16: the factors of products up to the heads in 16 bits, all else in 32; for processors with
+    instructions for it, and GPUs."""
 
     def __post_init__(self) -> None:
         _require(
@@ -242,7 +243,8 @@ class TrainConfig:
     test_horizon: int | None = 200
     """Frames of those rollouts; None: to the end."""
     precision: Precision = "float32"
-    """bf16: the message passing in 16 bits, everything around it in 32; for large networks."""
+    """bf16: the factors of products up to the heads in 16 bits, all else in 32; for processors with
+    instructions for it, and GPUs."""
 
     def __post_init__(self) -> None:
         _require(

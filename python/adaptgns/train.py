@@ -110,7 +110,7 @@ def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path
     folder = group.same(lambda: run_folder(config))
     checkpoint = None if config.resume is None else read_checkpoint(config.resume / LAST)
     threads = config.threads or torch.get_num_threads()
-    if torch_device(config.device).type == "cpu" and config.precision == "float32":
+    if torch_device(config.device).type == "cpu":
         divide_threads(threads)
     else:
         torch.set_num_threads(threads)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from adaptgns import fused
+from adaptgns import _core, fused
 from adaptgns.checkpoint import LAST, read_checkpoint
 from adaptgns.config import Precision, RolloutConfig, TrainConfig
 from adaptgns.rollout import write_rollouts
@@ -34,6 +35,14 @@ def test_bf16_is_float32_within_its_rounding(
 ) -> None:
     """bf16 rounds to 2^-9; three steps add up a few such errors in the outputs, and in the
     gradients, which go through them twice, some more."""
+    asked: list[bool] = []
+    for name in ("network_forward", "network_backward"):
+
+        def spied(*arguments: Any, name: str = name, **options: Any) -> Any:
+            asked.append(options["bf16"])
+            return getattr(_core, name)(*arguments, **options)
+
+        monkeypatch.setattr(fused, name, spied)
     if form == "torch":
         monkeypatch.setattr(fused, "applies", lambda _: False)
     case = Case(300, 2_000, latent=32, steps=3, with_edges=with_edges)
@@ -41,6 +50,7 @@ def test_bf16_is_float32_within_its_rounding(
     exact = case.run()
     case.network.precision = "bf16"
     rounded = case.run()
+    assert asked == ([False, False, True, True] if form == "core" else [])
     assert all(tensor.dtype == torch.float32 for tensor in rounded)
     assert all(0 < off(a, b) < 0.01 for a, b in zip(rounded[:outputs], exact, strict=False))
     together, reference = (
@@ -76,6 +86,21 @@ def test_only_edges_and_products_are_in_bf16(monkeypatch: pytest.MonkeyPatch) ->
     assert seen["layers.0.node_mlp.0"][1] == low
     assert seen["layers.0.node_mlp.3"][1] == full  # the LayerNorm
     assert seen["decoder"] == seen["variance_head"] == (full, full)
+
+
+def test_heads_of_the_core_are_in_float32() -> None:
+    """Of numbers that bf16 has, an encoder gives the same either way; a head's do not fit in it."""
+    rng = np.random.default_rng(0)
+    bias = np.zeros(32, np.float32)
+    encoder = [np.eye(32, dtype=np.float32), bias]
+    head = [rng.random((2, 32), dtype=np.float32), bias[:2]]
+    nodes = rng.integers(0, 100, (50, 32)).astype(np.float32)
+    exact, rounded = (
+        _core.network_forward([encoder, head], nodes, None, heads=1, keep=False, bf16=bf16)[0][0]
+        for bf16 in (False, True)
+    )
+    np.testing.assert_allclose(exact, nodes @ head[0].T, rtol=1e-6)
+    np.testing.assert_allclose(rounded, exact, rtol=1e-6)
 
 
 def test_training_in_bf16_keeps_float32_and_rollouts_stay_close(

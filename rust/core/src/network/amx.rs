@@ -8,7 +8,7 @@ use std::arch::asm;
 use std::arch::x86_64::*;
 use std::cell::RefCell;
 use std::ops::Range;
-use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU8, Ordering};
 
 use super::bf16::Right;
 use super::matrix::{End, Matrix, Start};
@@ -43,18 +43,41 @@ pub(super) struct Part<'a> {
     columns: usize,
 }
 
-/// Whether a thread that asks may use tiles: the processor has them, with vectors for the rest, and
-/// the system lets this process. Not so on systems whose way of asking is unknown here.
-pub(super) fn allowed() -> bool {
-    static ALLOWED: OnceLock<bool> = OnceLock::new();
-    *ALLOWED.get_or_init(|| {
-        const LEAF: u32 = 7;
-        const BF16_AND_TILES: u32 = 1 << 22 | 1 << 24;
-        is_x86_feature_detected!("avx512bf16")
-            && __get_cpuid_max(0).0 >= LEAF
-            && __cpuid_count(LEAF, 0).edx & BF16_AND_TILES == BF16_AND_TILES
-            && granted()
-    })
+#[cfg(test)]
+thread_local! {
+    /// Whether this thread may use tiles where there are some.
+    pub(super) static TILES: std::cell::Cell<bool> = const { std::cell::Cell::new(true) };
+}
+
+/// Whether the processor has tiles, and vectors for what lies around them, and the system lets this
+/// process use them. It is asked for that here, so that nobody asks who needs none.
+pub(super) fn available() -> bool {
+    const UNKNOWN: u8 = 0;
+    const NO: u8 = 1;
+    const YES: u8 = 2;
+    // No lock, which a process that forked meanwhile would never see opened; twice does no harm.
+    static ALLOWED: AtomicU8 = AtomicU8::new(UNKNOWN);
+    #[cfg(test)]
+    if !TILES.get() {
+        return false;
+    }
+    if processor() < Processor::V4 {
+        return false;
+    }
+    if ALLOWED.load(Ordering::Relaxed) == UNKNOWN {
+        let allowed = if exist() && granted() { YES } else { NO };
+        ALLOWED.store(allowed, Ordering::Relaxed);
+    }
+    ALLOWED.load(Ordering::Relaxed) == YES
+}
+
+fn exist() -> bool {
+    const LEAF: u32 = 7;
+    const BF16_AND_TILES: u32 = 1 << 22 | 1 << 24;
+    // SAFETY: every processor of 64 bits tells what it has.
+    #[allow(unused_unsafe, reason = "safe since Rust 1.94")]
+    let (most, has) = unsafe { (__get_cpuid_max(0).0, __cpuid_count(LEAF, 0).edx) };
+    is_x86_feature_detected!("avx512bf16") && most >= LEAF && has & BF16_AND_TILES == BF16_AND_TILES
 }
 
 #[cfg(target_os = "linux")]
@@ -65,13 +88,10 @@ fn granted() -> bool {
     unsafe { libc::syscall(libc::SYS_arch_prctl, REQUEST, TILE_DATA) == 0 }
 }
 
+/// Other systems' way of asking is not known here.
 #[cfg(not(target_os = "linux"))]
 fn granted() -> bool {
     false
-}
-
-fn available() -> bool {
-    processor() == Processor::Amx
 }
 
 impl Tiles {
@@ -91,6 +111,9 @@ impl Tiles {
         columns: Range<usize>,
         inner: usize,
     ) -> Option<Part<'_>> {
+        assert!(
+            rows.end <= inner && columns.end.div_ceil(SIDE) * self.depth * SIDE <= self.lines.len()
+        );
         let whole = rows.start.is_multiple_of(DEPTH)
             && (rows.end.is_multiple_of(DEPTH) || rows.end == inner)
             && columns.start.is_multiple_of(SIDE);
@@ -242,7 +265,7 @@ pub(super) fn product(
         Right::Tiles(part) => (part.rows, part.columns),
     };
     assert_eq!(inner, inner_of_b, "inner sizes");
-    assert!(available());
+    assert!(available() && inner > 0 && columns <= stride);
     if rows == 0 || columns == 0 {
         return;
     }

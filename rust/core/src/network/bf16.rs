@@ -1,14 +1,15 @@
 //! Products of numbers rounded to bf16, summed in float32.
 //!
 //! The product of two bf16 numbers is exact in float32, so that a processor without instructions for
-//! them gets the same from those of float32, but for the order of the sums.
+//! them gets the same from those of float32, but for the order of the sums, and for numbers below
+//! 2^-126, which the instructions take for 0.
 
 use super::buffer::Buffer;
 use super::matrix::{self, End, Matrix, Start};
-#[cfg(target_arch = "x86_64")]
-use super::rows::{Processor, processor};
+use super::rows::vectorized;
 
 /// `x`, rounded to the nearest bf16 number, ties to even; NaN stays.
+#[inline(always)]
 fn rounded(x: f32) -> f32 {
     let bits = x.to_bits();
     let nearest = bits.wrapping_add(0x7fff + (bits >> 16 & 1));
@@ -16,10 +17,12 @@ fn rounded(x: f32) -> f32 {
     f32::from_bits(if x.is_nan() { quiet } else { nearest } & 0xffff_0000)
 }
 
-/// All of `numbers`, rounded so.
-pub(super) fn round(numbers: &mut [f32]) {
-    for x in numbers {
-        *x = rounded(*x);
+vectorized! {
+    /// All of `numbers`, rounded to bf16.
+    fn round(numbers: &mut [f32]) {
+        for x in numbers {
+            *x = rounded(*x);
+        }
     }
 }
 
@@ -45,7 +48,7 @@ pub(super) fn product(
     end: End<'_>,
 ) {
     #[cfg(target_arch = "x86_64")]
-    if processor() == Processor::Amx {
+    if super::amx::available() {
         return super::amx::product(out, stride, start, a, b, end);
     }
     let copy = |of: Matrix<'_>| {

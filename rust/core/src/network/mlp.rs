@@ -4,7 +4,7 @@ use std::ops::{DerefMut, Range};
 use std::sync::OnceLock;
 
 #[cfg(target_arch = "x86_64")]
-use super::amx::Tiles;
+use super::amx::{self, Tiles};
 use super::bf16::{self, Right};
 use super::buffer::Buffer;
 use super::matrix::{End, Matrix, Start, product};
@@ -141,7 +141,7 @@ impl Factor<'_> {
 
     fn rounded(&self) -> Right<'_> {
         #[cfg(target_arch = "x86_64")]
-        if rows::processor() == rows::Processor::Amx {
+        if amx::available() {
             let tiles = (self.copies.tiles).get_or_init(|| Tiles::of_right(self.weight));
             if let Some(part) = tiles.part(
                 self.rows.clone(),

@@ -866,12 +866,24 @@ mod tests {
             .collect()
     }
 
-    const PROCESSORS: [Processor; 4] = [
-        Processor::Plain,
-        Processor::V3,
-        Processor::V4,
-        Processor::Amx,
+    /// Kinds of processors, and whether they have tiles.
+    const PROCESSORS: [(Processor, bool); 4] = [
+        (Processor::Plain, false),
+        (Processor::V3, false),
+        (Processor::V4, false),
+        (Processor::V4, true),
     ];
+
+    /// Lets this thread use no more of its processor than that.
+    fn be((most, tiles): (Processor, bool)) {
+        MOST.set(most);
+        #[cfg(target_arch = "x86_64")]
+        amx::TILES.set(tiles);
+    }
+
+    fn be_whole() {
+        be(PROCESSORS[3]);
+    }
 
     type Product = fn(&mut [f32], usize, Start<'_>, Matrix<'_>, Matrix<'_>, End<'_>);
 
@@ -983,16 +995,16 @@ mod tests {
     proptest! {
         #[test]
         fn products_are_sums_of_products(case in cases(21, 9, 75), kind in 0usize..3) {
-            MOST.set(PROCESSORS[kind]);
+            be(PROCESSORS[kind]);
             case.check(matrix::product, |_| {}, 1e-5)?;
-            MOST.set(Processor::Amx);
+            be_whole();
         }
 
         #[test]
         fn products_in_bf16_are_those_of_rounded_numbers(
             case in cases(140, 90, 75), kind in 0usize..4,
         ) {
-            MOST.set(PROCESSORS[kind]);
+            be(PROCESSORS[kind]);
             case.check(
                 |out, stride, start, a, b, end| {
                     bf16::product(out, stride, start, a, Right::Fresh(b), end);
@@ -1000,7 +1012,7 @@ mod tests {
                 bf16::round,
                 2e-5,
             )?;
-            MOST.set(Processor::Amx);
+            be_whole();
         }
     }
 
@@ -1018,7 +1030,7 @@ mod tests {
             seed: 5,
         };
         for kind in PROCESSORS {
-            MOST.set(kind);
+            be(kind);
             for transposed in [false, true] {
                 let product = |out: &mut _,
                                stride,
@@ -1031,7 +1043,7 @@ mod tests {
                 case(transposed).check(product, bf16::round, 3e-4).unwrap();
             }
         }
-        MOST.set(Processor::Amx);
+        be_whole();
     }
 
     /// Some rows and columns of a weight, whether they begin with tiles or not.
@@ -1041,7 +1053,7 @@ mod tests {
         let mut weight = numbers(1, inputs * outputs);
         let (bias, mut rows) = (vec![0.0; outputs], numbers(2, 5 * inputs));
         for kind in PROCESSORS {
-            MOST.set(kind);
+            be(kind);
             let linear = Linear::new(&weight, &bias, Precision::Bf16);
             for (first, count) in [(0, 96), (32, 64), (64, 32), (32, 32), (20, 30), (64, 20)] {
                 let mut out = vec![0.0; 5 * outputs];
@@ -1062,7 +1074,7 @@ mod tests {
                 }
             }
         }
-        MOST.set(Processor::Amx);
+        be_whole();
         // Not only of numbers that are rounded.
         assert!(
             weight
@@ -1115,7 +1127,7 @@ mod tests {
     #[test]
     fn nan_stays_and_is_not_positive() {
         for most in PROCESSORS {
-            MOST.set(most);
+            be(most);
             for columns in [1, 8, 16, 32] {
                 let (nan, one) = (vec![f32::NAN; columns], [1.0]);
                 let (nans, ones) = (Matrix::new(&nan, columns), Matrix::new(&one, 1));
@@ -1131,7 +1143,7 @@ mod tests {
                     assert!(out.iter().all(|&x| x == 0.0), "{most:?}, {columns}");
                 }
             }
-            MOST.set(Processor::Amx);
+            be_whole();
         }
     }
 
@@ -1244,9 +1256,9 @@ mod tests {
             for width in [20, 32] {
                 let best = ring(300, width, precision, one);
                 for most in PROCESSORS {
-                    MOST.set(most);
+                    be(most);
                     let other = ring(300, width, precision, one);
-                    MOST.set(Processor::Amx);
+                    be_whole();
                     assert!(difference(&best.0, &other.0) < error, "{most:?}, {width}");
                     assert!(difference(&best.1, &other.1) < error, "{most:?}, {width}");
                 }

@@ -22,15 +22,12 @@ macro_rules! vectorized {
                     type Lanes = std::arch::x86_64::__m256;
                     $body
                 }
-                use $crate::network::rows::Processor;
                 match $crate::network::rows::processor() {
-                    Processor::V4 | Processor::Amx => {
-                        // SAFETY: the processor has them.
-                        return unsafe { v4($($argument),*) };
-                    }
                     // SAFETY: the processor has them.
-                    Processor::V3 => return unsafe { v3($($argument),*) },
-                    Processor::Plain => {}
+                    $crate::network::rows::Processor::V4 => return unsafe { v4($($argument),*) },
+                    // SAFETY: the processor has them.
+                    $crate::network::rows::Processor::V3 => return unsafe { v3($($argument),*) },
+                    $crate::network::rows::Processor::Plain => {}
                 }
             }
             #[allow(dead_code, reason = "not every body names it")]
@@ -41,19 +38,18 @@ macro_rules! vectorized {
 }
 pub(super) use vectorized;
 
-/// What a processor has, the least first: nothing that needs asking, AVX2 with FMA, AVX-512, tiles.
+/// What a processor has, the least first: nothing that needs asking, AVX2 with FMA, AVX-512.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Processor {
     Plain,
     V3,
     V4,
-    Amx,
 }
 
 #[cfg(test)]
 thread_local! {
     /// The most that this thread uses of its processor.
-    pub(super) static MOST: std::cell::Cell<Processor> = const { std::cell::Cell::new(Processor::Amx) };
+    pub(super) static MOST: std::cell::Cell<Processor> = const { std::cell::Cell::new(Processor::V4) };
 }
 
 /// The processor at hand.
@@ -65,9 +61,7 @@ pub(super) fn processor() -> Processor {
         && is_x86_feature_detected!("avx512vl")
         && is_x86_feature_detected!("avx512bw")
         && is_x86_feature_detected!("avx512dq");
-    let most = if v4 && super::amx::allowed() {
-        Processor::Amx
-    } else if v4 {
+    let most = if v4 {
         Processor::V4
     } else if v3 {
         Processor::V3
