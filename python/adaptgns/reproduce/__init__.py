@@ -116,6 +116,9 @@ def make(config: ReproduceConfig, study: Study, runs: Sequence[Run], console: Co
         if whole:  # of several that share a study, the gate is one's to pass
             data.pass_gate(console)
     todo = [run for run in runs if not run.done]
+    for data in study.sets.values():
+        if any(split == "long" for run in todo if run.data is data for _, split in run.missing):
+            data.describe_long()
     failed = (one_by_one if config.jobs == 1 else in_processes)(config, todo, console)
     if todo:
         write_json(study.out / "machine.json", _machine())

@@ -20,7 +20,7 @@ from adaptgns.data.scenes import SCENES
 from adaptgns.data.trajectories import open_split
 from adaptgns.graph import radius_graph
 from adaptgns.losses import training_loss
-from adaptgns.reproduce.runs import Run
+from adaptgns.reproduce.runs import Run, Split
 from adaptgns.segment import Graph
 
 REPEATS = 3
@@ -40,17 +40,15 @@ def seconds(run: Run) -> float:
     forward, both = _step(base, model.edges, model.loss, samples * train, factor)
     unrolled = 1 + (base.unroll - 1) / 2  # in the second half alone
     training = 0.0
-    if model.weights is None and not run.trained_whole:
+    if model.chosen is None and not run.trained_whole:
         a_step = both * unrolled + (forward if model.graph != "base" else 0.0)
         training = model.share * run.data.steps * a_step
     one, _ = _step(base, model.edges, model.loss, test, factor)
-    trajectories, frames = _test(run)
-    steps = frames if profile.horizon is None else min(frames, profile.horizon)
-    missing = [policy for policy in model.policies if not run.metrics(policy).exists()]
-    passes = sum(2 if policy == "two-pass" else 1 for policy in missing)
-    return training + 2 * passes * min(trajectories, profile.trajectories or trajectories) * (
-        steps * one  # each rollout beside its single steps from true positions
+    passes = sum(
+        (2 if policy == "two-pass" else 1) * _rollout_steps(run, split)
+        for policy, split in run.missing
     )
+    return training + 2 * passes * one  # each rollout beside its single steps from true positions
 
 
 def _plan(run: Run, split: str) -> SplitPlan | None:
@@ -75,13 +73,18 @@ def _particles(run: Run, split: str) -> int:
     return int(np.median(drawn))
 
 
-def _test(run: Run) -> tuple[int, int]:
-    """Test trajectories, and frames that can be predicted of each."""
-    plan = _plan(run, "test")
+def _rollout_steps(run: Run, split: Split) -> int:
+    """Of all rollouts of the test set, or of the long trajectories."""
+    profile, long = run.study.profile, run.data.long if split == "long" else None
+    plan = (long and long.plan) or _plan(run, "test")
     if plan is None:
-        split = open_split(run.data.folder, "test")
-        return len(split), int(np.median(split.lengths)) - HISTORY
-    return plan.trajectories, plan.frames - HISTORY
+        test = open_split(run.data.folder, "test")
+        count, frames = len(test), int(np.median(test.lengths)) - HISTORY
+    else:
+        count, frames = plan.trajectories, plan.frames - HISTORY
+    if long is not None:
+        return count * frames
+    return min(count, profile.trajectories or count) * min(frames, profile.horizon or frames)
 
 
 @lru_cache

@@ -59,6 +59,8 @@ def _drawn(results: Results) -> Iterator[tuple[str, Figure]]:
         yield "graphs", _graphs(results, snapshots)
         yield "sigma", _sigma(snapshots)
     yield "steps", _steps(results, sets)
+    if results.long:
+        yield "long", _long(results)
     yield "pareto", _pareto(results, sets)
     yield "reliability", _reliability(results, sets)
     yield "clouds", _clouds(results, sets)
@@ -179,6 +181,26 @@ def _steps(results: Results, sets: list[DataSet]) -> Figure:
         edges.plot(np.arange(1, len(true) + 1), true, color=BASELINE, label="true positions")
         edges.set(title=f"{data.name}: directed edges of a step", xlabel="step")
         errors.set(title=f"{data.name}: position MSE, length²", xlabel="step", yscale="log")
+    figures.legend(figure, rows[0][0])
+    return figure
+
+
+def _long(results: Results) -> Figure:
+    """Error and clumping of the long rollouts at every step."""
+    figure, rows = _panels(2, 2.3 * len(results.long), len(results.long))
+    for (errors, ratios), (name, made) in zip(rows, results.long.items(), strict=True):
+        for series in made:
+            _band(errors, series.curve("mse"), series)
+            predicted, true = (
+                series.curve(f"edges_within_radius{which}") for which in ("", "_true")
+            )
+            _band(ratios, predicted / true, series)
+        centre = results.study.sets[name].described_long["centroid_mse_mean"]
+        steps = np.arange(1, len(centre) + 1)
+        errors.plot(steps, centre, color=BASELINE, label="all particles at their true centre")
+        ratios.axhline(1.0, color=BASELINE)
+        errors.set(title=f"{name}: position MSE, length²", xlabel="step", yscale="log")
+        ratios.set(title=f"{name}: edges within r, predicted over true", xlabel="step")
     figures.legend(figure, rows[0][0])
     return figure
 

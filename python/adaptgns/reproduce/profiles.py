@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from adaptgns.atomic import six_digits
-from adaptgns.config import AdaptiveConfig, Loss, PolicyName, TrainConfig
+from adaptgns.config import HISTORY, AdaptiveConfig, Loss, PolicyName, TrainConfig
 from adaptgns.data.generation import SplitPlan
 from adaptgns.presets import PRESETS
 
@@ -20,6 +20,18 @@ DENSER = 0.019 / 0.015
 MIDDLE = 0.0176 / 0.015
 """The same for the one that matches the adaptive graph's edges on its sand."""
 PRIORS: tuple[PolicyName, ...] = ("acceleration", "divergence")
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A rule of the adaptive graph that a sweep chooses on validation, with the first seed."""
+
+    weights: str
+    """Name of the model that it is chosen for, whose training is used"""
+    budget: str
+    """Name of the model whose fixed graph has as many edges there as the rule may have"""
+    folder: str
+    """Name of the sweep's folder"""
 
 
 @dataclass(frozen=True)
@@ -44,13 +56,13 @@ class Model:
     timed_as: str | None = None
     """Name of the model whose steps take as long, being of the same network"""
     policies: tuple[PolicyName, ...] = ("fixed",)
-    weights: str | None = None
-    """Name of the model whose training it uses, under the rule that the sweep chose"""
+    chosen: Chosen | None = None
+    """Of a model that is another one's training under a rule of its own"""
 
     @property
     def depends(self) -> bool:
         """Whether it comes after the other models."""
-        return self.weights is not None or self.radius == "matched"
+        return self.chosen is not None or self.radius == "matched"
 
     def config(self, base: TrainConfig, seed: int, radius: float) -> TrainConfig:
         """Of its training, by the profile's ``base``; ``radius`` is that of the data."""
@@ -83,7 +95,11 @@ NLL = Model(
     policies=("fixed", "adaptive", "random", "two-pass", "knn", "two-sided", *PRIORS),
 )
 TUNED = Model(
-    "tuned", "AdaptGNS, chosen rule", "nll", policies=("adaptive", "random"), weights="nll"
+    "tuned",
+    "AdaptGNS, chosen rule",
+    "nll",
+    policies=("adaptive", "random"),
+    chosen=Chosen(weights="nll", budget="mse", folder="sweep"),
 )
 EARLY = tuple(
     replace(
@@ -112,6 +128,14 @@ LONG_NLL = replace(
     share=4.0,
     seeds=1,
     timed_as="nll",
+)
+LONG_TUNED = replace(
+    TUNED,
+    name="tuned-400",
+    title="AdaptGNS, chosen rule, 400 % of the steps, one seed",
+    share=4.0,
+    seeds=1,
+    chosen=Chosen(weights="nll-400", budget="nll-400", folder="sweep-400"),
 )
 ADAPTIVE_NLL = replace(
     NLL,
@@ -204,6 +228,21 @@ class Sweep:
 
 
 @dataclass(frozen=True)
+class Long:
+    """Rollouts of one model to the end of long trajectories."""
+
+    model: str
+    """Its name"""
+    marks: tuple[int, ...]
+    """Steps at which errors are reported, up to the last"""
+    plan: SplitPlan | None = None
+    """Of the trajectories, as split "test": the data's own, under the same seed, that go on for
+    longer; None: the data's own"""
+    policies: tuple[PolicyName, ...] = ("fixed", "adaptive", "random", "two-sided")
+    """The first is the one that the others are compared with"""
+
+
+@dataclass(frozen=True)
 class Profile:
     """Which models are run, and how large everything is."""
 
@@ -224,10 +263,20 @@ class Profile:
     """Training steps past which it is not doubled again"""
     plans: Mapping[str, Mapping[str, SplitPlan]] = field(default_factory=dict)
     """Data sets that are generated for this profile instead of the embedded ones"""
+    long: Mapping[str, Long] = field(default_factory=dict)
+    """By data set: rollouts over far more frames than :attr:`horizon`"""
 
     def seeds_of(self, model: Model) -> tuple[int, ...]:
         """Those that ``model`` is trained with."""
         return self.seeds[: model.seeds]
+
+    def model(self, name: str) -> Model:
+        """The one of that name."""
+        return next(model for model in self.models if model.name == name)
+
+
+WATER_TO_THE_END = Long("nll", marks=(200, 500, 1000 - HISTORY))
+"""Of the paper's 1,000 frames"""
 
 
 PROFILES: dict[ProfileName, Profile] = {
@@ -242,6 +291,7 @@ PROFILES: dict[ProfileName, Profile] = {
             LONG_MSE,
             DECOUPLED,
             TUNED,
+            LONG_TUNED,
         ),
         sweep=Sweep(tau=(70.0,), factor=(1.1, 1.267), radius=(0.9, 1.0)),
         seeds=(0, 1),
@@ -254,6 +304,13 @@ PROFILES: dict[ProfileName, Profile] = {
                 "test": SplitPlan(scene, 2, frames=24, particles=(30, 50)),
             }
             for scene in ("waterdrop", "sand")
+        },
+        long={
+            "waterdrop": Long(
+                LONG_NLL.name,
+                marks=(10, 20, 40 - HISTORY),
+                plan=SplitPlan("waterdrop", 2, frames=40, particles=(30, 50)),
+            )
         },
     ),
     "laptop": Profile(
@@ -270,12 +327,20 @@ PROFILES: dict[ProfileName, Profile] = {
             ADAPTIVE_NLL,
             *ONE_SEED,
             TUNED,
+            LONG_TUNED,
         ),
         sweep=Sweep(trajectories=5),
         seeds=(0, 1, 2),
         marks=(50, 100, 200),
         trajectories=10,
         horizon=200,
+        long={
+            "waterdrop": replace(
+                WATER_TO_THE_END,
+                model=LONG_NLL.name,
+                plan=SplitPlan("waterdrop", 10, frames=1000),
+            )
+        },
     ),
     "full": Profile(
         base=replace(PRESETS["laptop"], steps=120_000, validate_every=10_000, validate_horizon=200),
@@ -291,6 +356,7 @@ PROFILES: dict[ProfileName, Profile] = {
                 "test": SplitPlan("waterdrop", 30, frames=1000),
             },
         },
+        long={"waterdrop": WATER_TO_THE_END},
     ),
     "paper": Profile(
         base=PRESETS["paper"],
@@ -309,5 +375,6 @@ PROFILES: dict[ProfileName, Profile] = {
                 "test": SplitPlan("sand", 30, frames=320),
             },
         },
+        long={"waterdrop": WATER_TO_THE_END},
     ),
 }

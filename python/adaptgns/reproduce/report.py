@@ -25,6 +25,7 @@ CAPTIONS = {
     "seed.",
     "pareto": "What the error costs, in edges and in time, with its 95 % interval.",
     "reliability": "Predicted and measured errors by deciles, a line for each seed.",
+    "long": "Long rollouts: the error, and edges within the data's radius, predicted over true.",
     "clouds": "Kinetic energy, and the distance between predicted and true clouds.",
 }
 STYLE = """
@@ -103,11 +104,15 @@ def _markdown(study: Study, made: list[Table], images: list[Path]) -> str:
             parts.append(table.note)
     parts.append("## Figures")
     for data in study.sets.values():
-        heat_map = (data.metrics / "sweep" / f"{HEAT_MAP}.png").relative_to(study.out).as_posix()
-        parts.append(
-            f"![sweep]({heat_map})\n\nThe adaptive rule on {data.name}, validation: error and, "
-            "below it, edges a step."
-        )
+        for model in study.profile.models:
+            if model.chosen is None:
+                continue
+            folder = data.metrics / model.chosen.folder
+            heat_map = (folder / f"{HEAT_MAP}.png").relative_to(study.out).as_posix()
+            parts.append(
+                f"![{model.chosen.folder}]({heat_map})\n\n{model.title}: the adaptive rule on "
+                f"{data.name}, validation: error and, below it, edges a step."
+            )
     for path in images:
         relative = path.relative_to(study.out).as_posix()
         parts.append(f"![{path.stem}]({relative})\n\n{CAPTIONS[path.stem]}")

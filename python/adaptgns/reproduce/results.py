@@ -19,7 +19,7 @@ from scipy.stats import t
 
 from adaptgns.config import PolicyName
 from adaptgns.reproduce.profiles import Model
-from adaptgns.reproduce.runs import DataSet, Run, Study, StudyError
+from adaptgns.reproduce.runs import DataSet, Run, Split, Study, StudyError
 
 LEVEL = 0.95
 
@@ -82,11 +82,12 @@ class Series:
     model: Model
     policy: PolicyName
     runs: tuple[Run, ...]
+    split: Split = "test"
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
         """What was measured, a row a seed; StudyError where a run is missing or another one."""
-        rows = [run.read(self.policy) for run in self.runs]
+        rows = [run.read(self.policy, self.split) for run in self.runs]
         counts = {len(row["scalars"]["mse"]["per_trajectory"]) for row in rows}
         if len(counts) > 1:
             raise StudyError(f"{self.files}: numbers of trajectories differ, {sorted(counts)}")
@@ -96,7 +97,8 @@ class Series:
     def files(self) -> list[str]:
         """The metrics that everything here comes from, below the study's folder."""
         return [
-            str(run.metrics(self.policy).relative_to(run.study.out).as_posix()) for run in self.runs
+            str(run.metrics(self.policy, self.split).relative_to(run.study.out).as_posix())
+            for run in self.runs
         ]
 
     def scalar(self, name: str) -> NDArray[np.float64]:
@@ -139,9 +141,24 @@ class Results:
             for policy in model.policies
         }
 
-    def _series(self, data: DataSet, model: Model, policy: PolicyName) -> Series:
+    def _series(
+        self, data: DataSet, model: Model, policy: PolicyName, split: Split = "test"
+    ) -> Series:
         runs = tuple(Run(data, model, seed) for seed in self.study.profile.seeds_of(model))
-        return Series(model, policy, runs)
+        return Series(model, policy, runs, split)
+
+    @cached_property
+    def long(self) -> dict[str, list[Series]]:
+        """The long rollouts, by data set that has some."""
+        model = self.study.profile.model
+        return {
+            data.name: [
+                self._series(data, model(data.long.model), policy, "long")
+                for policy in data.long.policies
+            ]
+            for data in self.study.sets.values()
+            if data.long is not None
+        }
 
     def of(self, data: str) -> list[Series]:
         """Those of one data set."""

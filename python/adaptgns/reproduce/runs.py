@@ -6,9 +6,14 @@ policies, and measures that. Files in the study's folder:
 - ``training/DATA/MODEL-SEED/``: what ``train`` writes; an interrupted run goes on from there
 - ``metrics/DATA/MODEL-SEED-POLICY.json``: what the report is made of, with its configuration
 - ``metrics/DATA/MODEL-SEED-adaptive.npz``: frames of its first trajectory, of one seed, for figures
+- ``metrics/DATA/MODEL-SEED-POLICY-long.json``: the same of long rollouts, and ``long.json``: what
+  their trajectories are like
 - ``metrics/DATA/data.json``: what the data are like; ``gate.json``: how long it had to be trained;
-  ``sweep/``: the rules that were tried on validation; ``times.json``: milliseconds of a step
+  ``sweep/``, ``sweep-400/``: the rules that were tried on validation; ``times.json``: milliseconds
+  of a step
 - ``data/``: data sets that are generated for a profile
+
+What comes with the package already, of the same configuration and data, is not trained again.
 """
 
 from __future__ import annotations
@@ -16,7 +21,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +32,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from adaptgns.atomic import six_digits, write_json, written_whole
-from adaptgns.checkpoint import LAST, Checkpoint, read_checkpoint
+from adaptgns.checkpoint import (
+    LAST,
+    PRETRAINED,
+    Checkpoint,
+    build_simulator,
+    read_checkpoint,
+)
 from adaptgns.config import (
     HISTORY,
     AdaptiveConfig,
@@ -47,13 +58,24 @@ from adaptgns.evaluate import STATISTICS_STEP, measure
 from adaptgns.graph_statistics import GraphStatistics, graph_statistics
 from adaptgns.policies import make_policy
 from adaptgns.processes import ALONE
-from adaptgns.reproduce.profiles import ADAPTIVE, DENSER, MSE, NLL, Model, Profile, ProfileName
+from adaptgns.reproduce.profiles import (
+    ADAPTIVE,
+    DENSER,
+    MSE,
+    NLL,
+    Chosen,
+    Long,
+    Model,
+    Profile,
+    ProfileName,
+)
 from adaptgns.rollout import Step, steps, write_rollouts
 from adaptgns.rollout_file import RolloutFile
 from adaptgns.sweep import RESULT, SweepConfig, sweep
 from adaptgns.train import train
 
-Split = Literal["train", "valid", "test"]
+Split = Literal["valid", "test", "long"]
+"""What is rolled out: a part of the data, or the trajectories of the long rollouts"""
 
 SNAPSHOTS = (1, 10, 50, 100)
 """Steps whose frames are kept for the figures"""
@@ -148,20 +170,12 @@ class DataSet:
         StudyError where that has been done of other data.
         """
         path = self.metrics / "data.json"
-        fingerprint = self._fingerprint()
-        if path.exists():
-            if read_json(path).get("fingerprint") != fingerprint:
-                raise StudyError(
-                    f"{path}: describes other data than those in {self.folder}. Give another --out"
-                )
+        train, valid, test = (open_split(self.folder, name) for name in ("train", "valid", "test"))
+        fingerprint = self._fingerprint(train, valid, test)
+        if _describes(path, fingerprint, self.folder):
             return
         metadata, marks = self.metadata, self.study.profile.marks
-        test, valid = (open_split(self.folder, split) for split in ("test", "valid"))
         shortest = min(int(test.lengths.min()) - HISTORY, STATISTICS_STEP)
-
-        def courses(split: Trajectories) -> Iterator[NDArray[np.float32]]:
-            """Positions ``[1 + steps, N, d]`` from the last that a rollout is given."""
-            return (trajectory.positions[HISTORY - 1 :] for trajectory in split)
 
         def statistics(frame: NDArray[np.float32]) -> GraphStatistics:
             return graph_statistics(frame, metadata.radius, metadata.box)
@@ -180,24 +194,60 @@ class DataSet:
                     [statistics(f).degree for frames in courses(valid) for f in frames[::EVERY]]
                 )
             ),
-            # The error of putting every particle at the true centre of all.
-            "centroid_mse": {
-                str(mark): [
-                    float(frames[mark].var(axis=0, dtype=np.float64).mean())
-                    if mark < len(frames)
-                    else math.nan
-                    for frames in courses(test)
-                ]
-                for mark in marks
-            },
+            "centroid_mse": centroid_mse(test, marks),
         }
         write_json(path, content)
 
-    def _fingerprint(self) -> str:
+    @property
+    def long(self) -> Long | None:
+        """The long rollouts that the profile asks for; None: none."""
+        return self.study.profile.long.get(self.source)
+
+    @cached_property
+    def long_folder(self) -> Path:
+        """Where their trajectories are, which are made where they have a plan."""
+        assert self.long is not None
+        plan = self.long.plan
+        if plan is None:
+            return self.folder
+        folder = self.study.out / "data" / f"{self.name}-long"
+        # Rollouts need no statistics of motion: one trajectory is enough to have some.
+        plans = {"train": replace(plan, trajectories=1), "test": plan}
+        generate_dataset(folder, plans, console=Console(stderr=True, quiet=folder.exists()))
+        return folder
+
+    def describe_long(self) -> None:
+        """As :meth:`describe`, of the trajectories of the long rollouts."""
+        assert self.long is not None
+        path = self.metrics / "long.json"
+        split = open_split(self.long_folder, "test")
+        fingerprint = self._fingerprint(split)
+        if _describes(path, fingerprint, self.long_folder):
+            return
+        last = int(split.lengths.min()) - HISTORY
+        if last < self.long.marks[-1]:
+            raise StudyError(
+                f"{self.long_folder}: a trajectory ends after step {last}; the long rollouts are "
+                f"reported at step {self.long.marks[-1]}"
+            )
+        every = centroid_mse(split, range(1, last + 1))
+        content = {
+            "fingerprint": fingerprint,
+            "trajectories": len(split),
+            "centroid_mse": {str(mark): every[str(mark)] for mark in self.long.marks},
+            "centroid_mse_mean": [float(np.mean(values)) for values in every.values()],
+        }
+        write_json(path, content)
+
+    @property
+    def described_long(self) -> dict[str, Any]:
+        """What :meth:`describe_long` wrote."""
+        return read_json(self.metrics / "long.json")
+
+    def _fingerprint(self, *splits: Trajectories) -> str:
         """Tells data apart by their metadata, sizes, and the ends of each split."""
         digest = hashlib.sha256(json.dumps(self.metadata.to_json(), sort_keys=True).encode())
-        for name in ("train", "valid", "test"):
-            split = open_split(self.folder, name)
+        for split in splits:
             digest.update(np.array([split.lengths, split.particle_counts], np.int64).tobytes())
             for index in (0, len(split) - 1):
                 digest.update(split[index].positions.tobytes())
@@ -216,12 +266,11 @@ class DataSet:
             return self.study.profile.base.steps
         return int(read_json(path)["steps"])
 
-    @property
-    def rule(self) -> dict[str, float]:
+    def rule(self, chosen: Chosen) -> dict[str, float]:
         """What the sweep chose. StudyError where it is missing or was another one."""
-        path = self.metrics / "sweep" / RESULT
+        path = self.metrics / chosen.folder / RESULT
         content = read_json(path)
-        config = self._sweep_config(content["settings"]["edges"])
+        config = self._sweep_config(chosen, content["settings"]["edges"])
         asked = json.loads(json.dumps(to_json(config)))
         for name, value in content["settings"].items():
             if asked[name] != value:
@@ -229,14 +278,14 @@ class DataSet:
                     f"{path}: was made with {name} {value}; the study has {asked[name]}. Remove "
                     "its folder, or give another --out"
                 )
-        chosen: dict[str, float] = content["chosen"]
-        return chosen
+        rule: dict[str, float] = content["chosen"]
+        return rule
 
-    def _sweep_config(self, budget: float) -> SweepConfig:
+    def _sweep_config(self, chosen: Chosen, budget: float) -> SweepConfig:
         profile, radius = self.study.profile, float(self.described["radius"])
         return SweepConfig(
-            checkpoint=Run(self, NLL, profile.seeds[0]).folder,
-            out=self.metrics / "sweep",
+            checkpoint=Path(chosen.weights),
+            out=self.metrics / chosen.folder,
             tau=profile.sweep.tau,
             factor=profile.sweep.factor,
             radius=tuple(six_digits(share * radius) for share in profile.sweep.radius),
@@ -246,25 +295,38 @@ class DataSet:
             device=self.study.device,
         )
 
-    def choose_rule(self, console: Console) -> None:
-        """Sweep the adaptive rule on validation, with the NLL model of the first seed, within the
-        edges that the fixed graph of the MSE model has there."""
-        if (self.metrics / "sweep" / RESULT).exists():
+    def choose_rule(self, chosen: Chosen, console: Console) -> None:
+        """Sweep the adaptive rule on validation, within its budget of edges."""
+        if (self.metrics / chosen.folder / RESULT).exists():
             return
         profile = self.study.profile
         seed, count = profile.seeds[0], profile.sweep.trajectories
-        Run(self, NLL, seed).require_training()
-        budget = valid_edges(self, MSE, seed, "fixed", trajectories=count)
-        sweep(replace(self._sweep_config(budget), data=str(self.folder)), console)
+        run = Run(self, profile.model(chosen.weights), seed)
+        run.require_training()
+        budget = profile.model(chosen.budget)
+        edges = valid_edges(self, budget, seed, "fixed", trajectories=count)
+        config = self._sweep_config(chosen, edges)
+        sweep(replace(config, checkpoint=run.checkpoint, data=str(self.folder)), console)
 
     def time_steps(self, runs: Sequence[Run]) -> None:
         """Time a step under every model and policy in ``runs``, in turns, on true positions of one
-        test trajectory."""
+        test trajectory; what has been timed is kept."""
         path = self.metrics / "times.json"
-        runs = [run for run in runs if run.model.timed_as is None]
-        names = {f"{run.model.name}, {policy}" for run in runs for policy in run.model.policies}
-        if path.exists() and names <= set(read_json(path)["times"]):
+        content: dict[str, Any] = {"threads": self.study.threads, "times": {}}
+        if path.exists():
+            content = read_json(path)
+        missing: dict[str, tuple[Run, PolicyName]] = {}
+        for run in runs:
+            for policy in run.model.policies:
+                if (name := timed_name(run.model, policy)) not in content["times"]:
+                    missing.setdefault(name, (run, policy))
+        if not missing:
             return
+        if content["threads"] != self.study.threads:
+            raise StudyError(
+                f"{path}: was timed with {content['threads']} threads, not {self.study.threads}; "
+                f"give --threads {content['threads']}, or remove it"
+            )
         test = open_split(self.folder, "test")
         sizes = test.particle_counts
         trajectory = test[int(np.argmin(np.abs(sizes - np.median(sizes))))]
@@ -272,19 +334,21 @@ class DataSet:
         trajectory = replace(trajectory, positions=trajectory.positions[start:])
         count = min(TIMED, len(trajectory.positions) - HISTORY)
         rolling: dict[str, Iterator[Step]] = {}
-        for run in runs:
-            simulator = read_checkpoint(run.folder).simulator()
-            simulator = simulator.to(torch_device(self.study.device))
-            for policy in run.model.policies:
-                config = run.rollout_config(policy)
-                rolling[f"{run.model.name}, {policy}"] = steps(
-                    simulator,
-                    trajectory,
-                    make_policy(policy, config.adaptive, k=config.k, seed=config.seed),
-                    count,
-                    radius=config.radius,
-                    teacher_forcing=True,
-                )
+        for name, (run, policy) in missing.items():
+            config = run.rollout_config(policy)
+            rule = make_policy(policy, config.adaptive, k=config.k, seed=config.seed)
+            if rule.needs_sigma:
+                simulator = read_checkpoint(run.checkpoint).simulator()
+            else:  # whatever its weights, a step has the same edges and takes as long
+                simulator = build_simulator(run.config(), self.metadata).eval()
+            rolling[name] = steps(
+                simulator.to(torch_device(self.study.device)),
+                trajectory,
+                rule,
+                count,
+                radius=config.radius,
+                teacher_forcing=True,
+            )
         times: dict[str, list[Step]] = {name: [] for name in rolling}
         for _ in range(count):
             for name, each in rolling.items():
@@ -294,7 +358,8 @@ class DataSet:
             {
                 "particles": len(trajectory.particle_type),
                 "threads": self.study.threads,
-                "times": {
+                "times": content["times"]
+                | {
                     name: {
                         kind: float(np.median([getattr(step, kind) for step in taken]))
                         for kind in ("graph_ms", "model_ms", "edges")
@@ -311,7 +376,7 @@ class DataSet:
 
     def step_time(self, model: Model, policy: PolicyName) -> dict[str, float]:
         """Of :attr:`times`, those of one model under one policy."""
-        name, times = f"{model.timed_as or model.name}, {policy}", self.times["times"]
+        name, times = timed_name(model, policy), self.times["times"]
         if name not in times:
             raise StudyError(
                 f"{self.metrics / 'times.json'}: has no step of {name}; the command without "
@@ -370,9 +435,28 @@ class Run:
     @property
     def trained(self) -> Model:
         """The model whose training it uses, as a rule its own."""
-        if self.model.weights is None:
-            return self.model
-        return next(m for m in self.study.profile.models if m.name == self.model.weights)
+        chosen = self.model.chosen
+        return self.model if chosen is None else self.study.profile.model(chosen.weights)
+
+    @property
+    def shipped(self) -> Path | None:
+        """The checkpoint that comes with the package, where it is what this run would train: of its
+        configuration, and of its data; before those are described, of some of that name."""
+        path = PRETRAINED / f"{self.data.name}.safetensors"
+        if self.trained.radius == "matched" or not path.exists():
+            return None
+        checkpoint = read_checkpoint(path)
+        if different(checkpoint.config, self._config(checkpoint.metadata.radius)):
+            return None
+        described = (self.data.metrics / "data.json").exists()
+        return None if described and checkpoint.metadata != self.data.metadata else path
+
+    @property
+    def checkpoint(self) -> Path:
+        """Of the training: its folder, or what comes with the package where nothing was trained."""
+        if (self.folder / LAST).exists():
+            return self.folder
+        return self.shipped or self.folder
 
     def metrics(self, policy: PolicyName, split: Split = "test") -> Path:
         """What was measured under ``policy``."""
@@ -380,45 +464,60 @@ class Run:
         return self.data.metrics / f"{self.model.name}-{self.seed}-{policy}{ending}.json"
 
     @property
+    def missing(self) -> list[tuple[PolicyName, Split]]:
+        """What is to be measured: under which policies, over what."""
+        long = self.data.long
+        wanted: list[tuple[PolicyName, Split]] = [(each, "test") for each in self.model.policies]
+        if long is not None and long.model == self.model.name:
+            wanted += [(each, "long") for each in long.policies]
+        return [each for each in wanted if not self.metrics(*each).exists()]
+
+    @property
     def done(self) -> bool:
         """Whether everything has been measured."""
-        return all(self.metrics(policy).exists() for policy in self.model.policies)
+        return not self.missing
 
     @property
     def trained_whole(self) -> bool:
-        """Whether its training has come to its end."""
+        """Whether its training has come to its end, or comes with the package."""
         last = self.folder / LAST
         if not last.exists():
-            return False
+            return self.shipped is not None
         checkpoint = self._own(last)
         return checkpoint.step == checkpoint.config.steps and checkpoint.validated
 
     def config(self) -> TrainConfig:
         """Of the training. StudyError where it depends on runs that are missing."""
-        base = replace(self.study.profile.base, steps=self.data.steps, data=self.data.source)
         radius = float(self.data.described["radius"])
-        config = self.trained.config(base, self.seed, radius)
+        config = self._config(radius)
         if self.model.radius == "matched":
             matched = matched_radius(self.data, self.seed, radius)
             config = replace(config, model=replace(config.model, radius=matched))
         return config
 
-    def rollout_config(self, policy: PolicyName) -> RolloutConfig:
-        """Of the rollouts under ``policy``."""
+    def _config(self, radius: float) -> TrainConfig:
+        """Of the training on data of that radius, but for a radius that depends on other runs."""
+        base = replace(self.study.profile.base, steps=self.data.steps, data=self.data.source)
+        return self.trained.config(base, self.seed, radius)
+
+    def rollout_config(self, policy: PolicyName, split: Split = "test") -> RolloutConfig:
+        """Of the rollouts under ``policy``; what of it is local says only where they belong."""
         profile, rule, radius = self.study.profile, ADAPTIVE, None
-        if self.model.weights is not None:
-            chosen = self.data.rule
+        if self.model.chosen is not None:
+            chosen = self.data.rule(self.model.chosen)
             rule, radius = AdaptiveConfig(chosen["tau"], chosen["factor"]), chosen["radius"]
+        long = split == "long"
         return RolloutConfig(
             checkpoint=self.folder,
             out=self.folder / f"{self.model.name}-{policy}.h5",
             data=str(self.data.source),
+            split="valid" if split == "valid" else "test",
             policy=policy,
             adaptive=rule,
             radius=radius,
             k=max(1, round(self.data.described["valid_degree"])),
-            steps=profile.horizon,
-            trajectories=profile.trajectories,
+            steps=None if long else profile.horizon,
+            trajectories=None if long else profile.trajectories,
             seed=self.seed,
             device=self.study.device,
         )
@@ -427,23 +526,24 @@ class Run:
         """Make what is missing of it."""
         if self.done:
             return
-        if self.model.weights is None:
+        if self.model.chosen is None:
             self.train(console)
         else:
             self.require_training()
-            self.data.choose_rule(console)
-        for policy in self.model.policies:
-            if self.metrics(policy).exists():
-                continue
-            drawn = (self.model.name, policy, self.seed) == (*DRAWN, self.study.profile.seeds[0])
-            content = self.measured(policy, console=console, snapshot=drawn)
-            write_json(self.metrics(policy), content)
+            self.data.choose_rule(self.model.chosen, console)
+        drawn = (*DRAWN, self.study.profile.seeds[0], "test")
+        for policy, split in self.missing:
+            snapshot = (self.model.name, policy, self.seed, split) == drawn
+            content = self.measured(policy, console=console, split=split, snapshot=snapshot)
+            write_json(self.metrics(policy, split), content)
 
     def require_training(self) -> None:
         """Raise StudyError unless its training is done."""
         name = f"{self.data.name}/{self.trained.name}-{self.seed}"
         last = self.folder / LAST
         if not last.exists():
+            if self.shipped is not None:
+                return
             raise StudyError(f"{self.name}: needs {name}, which is missing")
         checkpoint = self._own(last)
         if checkpoint.step < checkpoint.config.steps or not checkpoint.validated:
@@ -487,10 +587,15 @@ class Run:
     ) -> dict[str, Any]:
         """Roll out under ``policy``, and measure; the report as JSON, of which nothing tells where
         it was made."""
-        config = replace(self.rollout_config(policy), split=split, data=str(self.data.folder))
-        console.print(f"{self.name}: {split}, {policy}", highlight=False)
+        folder = self.data.long_folder if split == "long" else self.data.folder
+        config = replace(
+            self.rollout_config(policy, split), checkpoint=self.checkpoint, data=str(folder)
+        )
+        origin = "" if config.checkpoint == self.folder else ", the package's weights"
+        console.print(f"{self.name}: {split}, {policy}{origin}", highlight=False)
         write_rollouts(config, console)
-        content = measure([config.out], self.study.profile.marks).to_json()
+        marks, fingerprint = self._measures(split)
+        content = measure([config.out], marks).to_json()
         if snapshot:
             write_snapshot(config.out, self.metrics(policy).with_suffix(".npz"))
         config.out.unlink()
@@ -501,8 +606,15 @@ class Run:
                 for name in ("out", "checkpoint", "resume"):
                     settings.pop(name, None)
                 settings["data"] = self.data.name
-        content["data_fingerprint"] = self.data.described["fingerprint"]
+        content["data_fingerprint"] = fingerprint
         return content
+
+    def _measures(self, split: Split) -> tuple[tuple[int, ...], str]:
+        """Steps at which errors are reported, and what tells the data."""
+        if split == "long":
+            assert self.data.long is not None
+            return self.data.long.marks, self.data.described_long["fingerprint"]
+        return self.study.profile.marks, self.data.described["fingerprint"]
 
     def read(self, policy: PolicyName, split: Split = "test") -> dict[str, Any]:
         """The row of metrics of a split under ``policy``.
@@ -516,21 +628,51 @@ class Run:
                 f"--only '{self.name}'`"
             )
         content = read_json(path)
-        if content["data_fingerprint"] != self.data.described["fingerprint"]:
+        marks, fingerprint = self._measures(split)
+        if content["data_fingerprint"] != fingerprint:
             raise StudyError(f"{path}: was measured on other data. Remove it")
-        if content["marks"] != sorted(self.study.profile.marks):
+        if content["marks"] != sorted(marks):
             raise StudyError(f"{path}: was measured at other steps, {content['marks']}. Remove it")
         row: dict[str, Any] = content["rollouts"][0]
         settings = row["settings"]
         trained = from_json(TrainConfig, settings["training"], source=str(path))
         refuse_difference(str(path), trained, self.config())
-        asked = replace(self.rollout_config(policy), split=split)
+        asked = self.rollout_config(policy, split)
         # What older files lack has its default.
         known = {name: settings[name] for name in to_json(asked) if name in settings}
         local = {"checkpoint": "", "out": ""}
         made = from_json(RolloutConfig, {**local, **known}, source=str(path))
         refuse_difference(str(path), made, asked)
         return row
+
+
+def _describes(path: Path, fingerprint: str, folder: Path) -> bool:
+    """Whether ``path`` is there. StudyError where it describes other data than ``folder`` holds."""
+    if not path.exists():
+        return False
+    if read_json(path).get("fingerprint") != fingerprint:
+        raise StudyError(f"{path}: describes other data than those in {folder}. Give another --out")
+    return True
+
+
+def courses(split: Trajectories) -> Iterator[NDArray[np.float32]]:
+    """Positions ``[1 + steps, N, d]`` from the last that a rollout is given."""
+    return (trajectory.positions[HISTORY - 1 :] for trajectory in split)
+
+
+def centroid_mse(split: Trajectories, marks: Iterable[int]) -> dict[str, list[float]]:
+    """Of each trajectory, by step: the error of putting every particle at the true centre of all;
+    NaN past its end."""
+    errors = [frames.var(axis=1, dtype=np.float64).mean(axis=1) for frames in courses(split)]
+    return {
+        str(mark): [float(each[mark]) if mark < len(each) else math.nan for each in errors]
+        for mark in marks
+    }
+
+
+def timed_name(model: Model, policy: PolicyName) -> str:
+    """Names a step of ``model`` among the times."""
+    return f"{model.timed_as or model.name}, {policy}"
 
 
 def matched_radius(data: DataSet, seed: int, radius: float) -> float:
@@ -561,15 +703,19 @@ def valid_edges(
     return float(np.mean(np.array(edges[:trajectories], dtype=np.float64)))
 
 
+def different(made: object, wanted: object) -> list[str]:
+    """Settings that two configurations differ in, but for where and how they ran."""
+    found, asked = to_json(made), to_json(wanted)
+    return [name for name in asked if name not in LOCAL and found[name] != asked[name]]
+
+
 def refuse_difference(path: str, made: object, wanted: object) -> None:
     """Raise StudyError where two configurations differ in more than where and how they ran."""
-    found = to_json(made)
-    for name, value in to_json(wanted).items():
-        if name not in LOCAL and found[name] != value:
-            raise StudyError(
-                f"{path}: was made with {name} {found[name]}; the study has {value}. Remove it, or "
-                "give another --out"
-            )
+    for name in different(made, wanted):
+        raise StudyError(
+            f"{path}: was made with {name} {to_json(made)[name]}; the study has "
+            f"{to_json(wanted)[name]}. Remove it, or give another --out"
+        )
 
 
 def write_snapshot(rollouts: Path, path: Path) -> None:

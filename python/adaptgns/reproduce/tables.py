@@ -9,6 +9,7 @@ import numpy as np
 
 from adaptgns.config import PolicyName
 from adaptgns.evaluate import MATCHED
+from adaptgns.reproduce.profiles import Chosen, Model
 from adaptgns.reproduce.results import Estimate, Results, Series, estimate
 from adaptgns.reproduce.runs import EVERY, DataSet, read_json
 from adaptgns.sweep import RESULT
@@ -59,6 +60,21 @@ COMPARISONS: tuple[Comparison, ...] = (
         "adaptive NLL or fixed MSE, trained so: the aim",
         ("nll-400", "adaptive"),
         ("mse-400", "fixed"),
+    ),
+    (
+        "the chosen rule or fixed MSE, trained so: the aim",
+        ("tuned-400", "adaptive"),
+        ("mse-400", "fixed"),
+    ),
+    (
+        "the chosen rule or fixed, same model, trained so",
+        ("tuned-400", "adaptive"),
+        ("nll-400", "fixed"),
+    ),
+    (
+        "the chosen rule, uncertain or random, trained so",
+        ("tuned-400", "adaptive"),
+        ("tuned-400", "random"),
     ),
     (
         "two-sided NLL or fixed MSE, trained so: the aim",
@@ -167,7 +183,8 @@ def tables(results: Results) -> list[Table]:
             _rollouts(results, data),
             _comparisons(results, data),
             _clouds(results, data),
-            _sweep(results, data),
+            *([_long(results, data)] if data.name in results.long else []),
+            *_sweeps(results, data),
             *([_along(results, data)] if len(_shares(results, data)) > 1 else []),
             *_calibration(results, data),
         ]
@@ -270,7 +287,8 @@ def _rollouts(results: Results, data: DataSet) -> Table:
         "without self-edges. The ratio is "
         "that of edges within the data's radius on predicted over true positions, of their means "
         f"over all steps, and at step {mark} the mean of ratios: above 1, the predicted particles "
-        "clump. Milliseconds of a step are medians of all models and policies in turns, on true "
+        "clump. Milliseconds of a step are medians of all models and policies in turns, of those "
+        "that the study got later in turns among themselves, on true "
         f"positions of one trajectory of {data.times['particles']:,} particles, "
         f"{data.times['threads']} threads.",
     )
@@ -364,11 +382,80 @@ def matched(series: Series, mark: int) -> Estimate:
     return estimate(values[:, np.isfinite(values).all(axis=0)])
 
 
-def _sweep(results: Results, data: DataSet) -> Table:
-    path = data.metrics / "sweep" / RESULT
+def _long(results: Results, data: DataSet) -> Table:
+    """How far rollouts hold."""
+    assert data.long is not None
+    marks, made = data.long.marks, results.long[data.name]
+    first = made[0]
+    rows = []
+    for series in made:
+        predicted, true = (
+            series.curve(name).mean()
+            for name in ("edges_within_radius", "edges_within_radius_true")
+        )
+        rows.append(
+            Row(
+                [
+                    series.model.title,
+                    series.policy,
+                    *(_interval(series.estimate(f"mse@{mark}"), ".2e") for mark in marks),
+                    MISSING
+                    if series is first
+                    else _change(results, series, first, f"mse@{marks[-1]}"),
+                    _interval(series.estimate("edges_per_step"), ",.0f"),
+                    _number(predicted, ",.0f"),
+                    _number(true, ",.0f"),
+                    _number(predicted / true, ".2f"),
+                    _interval(series.estimate(f"clumping@{marks[-1]}"), ".2f"),
+                    _interval(series.estimate("kinetic_energy_error"), ".3f"),
+                ],
+                series.files if series is first else [*series.files, *first.files],
+            )
+        )
+    centre = data.described_long["centroid_mse"]
+    rows.append(
+        Row(
+            ["all particles at their true centre", MISSING]
+            + [_interval(estimate(np.array(centre[str(mark)])[None]), ".2e") for mark in marks]
+            + [MISSING] * 7,
+            [str((data.metrics / "long.json").relative_to(results.study.out).as_posix())],
+        )
+    )
+    return Table(
+        f"long-{data.name}",
+        f"Rollouts of {marks[-1]} steps on {data.name}",
+        (
+            "model",
+            "graph",
+            *(f"MSE@{mark}" for mark in marks),
+            f"MSE@{marks[-1]}, less {first.policy}",
+            "edges a step",
+            "edges within r, predicted",
+            "true",
+            "ratio",
+            f"ratio@{marks[-1]}",
+            "kinetic energy error",
+        ),
+        rows,
+        f"As in the tables above, of {data.described_long['trajectories']} trajectories to the "
+        "end: edges, ratio and energy are over all steps. A difference is in percent of what is "
+        "taken off, and paired by seed and trajectory.",
+    )
+
+
+def _sweeps(results: Results, data: DataSet) -> list[Table]:
+    return [
+        _sweep(results, data, model, model.chosen)
+        for model in results.study.profile.models
+        if model.chosen is not None
+    ]
+
+
+def _sweep(results: Results, data: DataSet, model: Model, chosen: Chosen) -> Table:
+    path = data.metrics / chosen.folder / RESULT
     content = read_json(path)
     file = str(path.relative_to(results.study.out).as_posix())
-    settings, chosen = content["settings"], content["chosen"]
+    settings, budget = content["settings"], results.study.profile.model(chosen.budget)
     rows = [
         Row(
             [
@@ -376,15 +463,15 @@ def _sweep(results: Results, data: DataSet) -> Table:
                 _number(row["mse"], ".2e"),
                 _number(row["edges"], ",.0f"),
                 _number(row["clumping"], ".2f"),
-                "yes" if row == chosen else "",
+                "yes" if row == content["chosen"] else "",
             ],
             [file],
         )
         for row in content["trials"]
     ]
     return Table(
-        f"sweep-{data.name}",
-        f"The adaptive rule on validation, {data.name}",
+        f"{chosen.folder}-{data.name}",
+        f"{model.title}: the adaptive rule on validation, {data.name}",
         (
             "tau",
             "factor",
@@ -395,8 +482,8 @@ def _sweep(results: Results, data: DataSet) -> Table:
             "chosen",
         ),
         rows,
-        f"One seed. The budget is that of the fixed MSE model there, {settings['edges']:,.0f} "
-        "directed edges a step.",
+        f"One seed. The budget is that of {budget.title} on the fixed graph there: "
+        f"{settings['edges']:,.0f} directed edges a step.",
     )
 
 
