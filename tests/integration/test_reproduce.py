@@ -12,18 +12,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from adaptgns.checkpoint import LAST, read_checkpoint, write_checkpoint
+from adaptgns.checkpoint import BEST, LAST, PRETRAINED, read_checkpoint, write_checkpoint
+from adaptgns.data.trajectories import open_split
 from adaptgns.fit import Diverged
 from adaptgns.reproduce import ReproduceConfig, main, reproduce, study_of
 from adaptgns.reproduce.estimates import seconds
 from adaptgns.reproduce.profiles import PROFILES
 from adaptgns.reproduce.report import MARKERS, write_into
 from adaptgns.reproduce.results import Estimate, Results, estimate
-from adaptgns.reproduce.runs import Run
+from adaptgns.reproduce.runs import Run, Study
 
 QUIET = Console(quiet=True)
-FIGURES = ("statistics", "graphs", "sigma", "steps", "pareto", "reliability", "clouds")
-TABLES = ("rollouts", "comparisons", "clouds", "sweep", "along", "calibration")
+FIGURES = ("statistics", "graphs", "sigma", "steps", "long", "pareto", "reliability", "clouds")
+TABLES = ("rollouts", "comparisons", "clouds", "sweep", "sweep-400", "along", "calibration")
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +63,16 @@ def test_every_table_and_figure_is_there(made: ReproduceConfig) -> None:
             assert any(key.startswith(f"{name}-{data}") for key in found), (name, data)
         questions = [row["cells"][0] for row in found[f"comparisons-{data}"]["rows"]]
         assert "adaptive NLL or fixed MSE: the aim" in questions
+        assert "the chosen rule or fixed MSE, trained so: the aim" in questions
+    assert "long-waterdrop" in found
+    assert "long-sand" not in found
     report = (folder(made) / "report.md").read_text()
     for name in FIGURES:
         assert f"(figures/{name}.png)" in report
         assert (folder(made) / "figures" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
         assert (folder(made) / "figures" / f"{name}.pdf").read_bytes()[:5] == b"%PDF-"
     page = (folder(made) / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == len(FIGURES) + 2, "and a heat map a set"
+    assert page.count("data:image/png;base64,") == len(FIGURES) + 4, "and a heat map a sweep"
     assert page.count("<table>") == len(found)
     assert str(folder(made)) not in report + (folder(made) / "tables.json").read_text()
 
@@ -106,17 +110,59 @@ def test_every_number_comes_from_the_files_that_its_row_names(made: ReproduceCon
     assert checked >= 60
 
 
-def test_the_chosen_rule_is_within_the_budget_and_what_is_reported(made: ReproduceConfig) -> None:
+def test_long_rollouts_go_on_where_the_others_end(made: ReproduceConfig) -> None:
+    """Their table is of the files that it names, and they are of the same trajectories."""
+    table = tables(made)["long-waterdrop"]
+    *rows, centre = table["rows"]
+    assert [row["cells"][1] for row in rows] == ["fixed", "adaptive", "random", "two-sided"]
+    for row in rows:
+        long = json.loads((folder(made) / row["files"][0]).read_text())
+        scalars, curves = (long["rollouts"][0][kind] for kind in ("scalars", "curves"))
+        assert len(curves["mse"]) == 34, "all that 40 frames leave"
+        ratio = np.mean(curves["edges_within_radius"]) / np.mean(curves["edges_within_radius_true"])
+        cells = dict(zip(table["columns"], row["cells"], strict=True))
+        for column, value in (
+            ("MSE@20", curves["mse"][19]),
+            ("MSE@34", curves["mse"][-1]),
+            ("edges a step", np.mean(curves["edges"])),
+            ("ratio", ratio),
+            ("ratio@34", scalars["clumping@34"]["mean"]),
+            ("kinetic energy error", scalars["kinetic_energy_error"]["mean"]),
+        ):
+            shown = float(cells[column].split(" [")[0].replace(",", ""))
+            assert shown == pytest.approx(value, rel=0.01, abs=0.51 if value > 10 else 0.006)
+        short = Path(row["files"][0].replace("-long", ""))
+        short = json.loads((folder(made) / short).read_text())["rollouts"][0]["scalars"]
+        assert scalars["mse@10"] == short["mse@10"]
+    described = json.loads((folder(made) / centre["files"][0]).read_text())
+    shown = [float(cell.split(" [")[0]) for cell in centre["cells"][2:5]]
+    assert shown == pytest.approx([np.mean(v) for v in described["centroid_mse"].values()], 0.01)
+    one, other = (
+        open_split(folder(made) / "data" / name, "test") for name in ("waterdrop", "waterdrop-long")
+    )
+    for begun, long in zip(one, other, strict=True):
+        np.testing.assert_array_equal(begun.positions, long.positions[: len(begun.positions)])
+
+
+@pytest.mark.parametrize(
+    ("tuned", "sweep", "budget", "seeds"),
+    [("tuned", "sweep", "mse", (0, 1)), ("tuned-400", "sweep-400", "nll-400", (0,))],
+)
+def test_the_chosen_rule_is_within_the_budget_and_what_is_reported(
+    made: ReproduceConfig, tuned: str, sweep: str, budget: str, seeds: tuple[int, ...]
+) -> None:
     for data in ("waterdrop", "sand"):
         metrics = folder(made) / "metrics" / data
-        result = json.loads((metrics / "sweep" / "sweep.json").read_text())
-        chosen, budget = result["chosen"], result["settings"]["edges"]
-        within = [row["mse"] for row in result["trials"] if row["edges"] <= budget]
+        result = json.loads((metrics / sweep / "sweep.json").read_text())
+        chosen, edges = result["chosen"], result["settings"]["edges"]
+        within = [row["mse"] for row in result["trials"] if row["edges"] <= edges]
         assert chosen["mse"] == min(within)
-        valid = json.loads((metrics / "mse-0-fixed-valid.json").read_text())["rollouts"][0]
-        assert budget == pytest.approx(valid["scalars"]["edges_per_step"]["mean"], rel=1e-5)
-        for seed in (0, 1):
-            row = json.loads((metrics / f"tuned-{seed}-adaptive.json").read_text())["rollouts"][0]
+        valid = json.loads((metrics / f"{budget}-0-fixed-valid.json").read_text())["rollouts"][0]
+        assert edges == pytest.approx(valid["scalars"]["edges_per_step"]["mean"], rel=1e-5)
+        for seed in seeds:
+            path = metrics / f"{tuned}-{seed}-adaptive.json"
+            row = json.loads(path.read_text())["rollouts"][0]
+            assert row["settings"]["training"]["steps"] == (48 if tuned == "tuned-400" else 12)
             assert row["settings"]["radius"] == chosen["radius"]
             assert row["settings"]["adaptive"]["factor"] == chosen["factor"]
             assert row["settings"]["training"]["seed"] == seed
@@ -148,6 +194,83 @@ def test_a_missing_run_is_told_and_the_report_stays(study: ReproduceConfig) -> N
     with pytest.raises(ValueError, match=r"nll-1-adaptive.json: missing.*--only 'sand/nll-1'"):
         reproduce(study, QUIET)
     assert (folder(study) / "report.md").read_bytes() == before
+
+
+def test_what_the_package_ships_is_not_trained(
+    made: ReproduceConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither for its own rollouts nor for what builds on them, unless anything differs."""
+    trained = folder(made) / "training" / "waterdrop" / "nll-400-0"
+    shipped = tmp_path / "shipped" / "waterdrop.safetensors"
+    shipped.parent.mkdir()
+    shutil.copyfile(trained / BEST, shipped)
+    monkeypatch.setattr("adaptgns.reproduce.runs.PRETRAINED", shipped.parent)
+
+    def failing(*_: object) -> None:
+        raise Diverged("it was trained")
+
+    monkeypatch.setattr("adaptgns.reproduce.runs.train", failing)
+    config = replace(made, out=tmp_path / "study", only="waterdrop/*-400-0", data=("waterdrop",))
+    shutil.copytree(folder(made) / "data", folder(config) / "data")
+    with pytest.raises(RuntimeError, match="1 runs failed: waterdrop/mse-400-0"):
+        reproduce(config, QUIET)
+    for name in ("nll-400-0-random.json", "nll-400-0-fixed-long.json", "tuned-400-0-adaptive.json"):
+        one, other = (
+            json.loads((folder(each) / "metrics" / "waterdrop" / name).read_text())["rollouts"][0]
+            for each in (made, config)
+        )
+        assert one["scalars"]["mse"] == other["scalars"]["mse"]
+        assert one["settings"] == other["settings"]
+    # A step is timed with it, too.
+    times = folder(config) / "metrics" / "waterdrop" / "times.json"
+    [data] = study_of(config).sets.values()
+    data.time_steps([Run(data, study_of(config).profile.model("tuned-400"), 0)])
+    assert list(json.loads(times.read_text())["times"]) == [
+        "tuned-400, adaptive",
+        "tuned-400, random",
+    ]
+
+    right = read_checkpoint(shipped)
+    metadata = replace(right.metadata, velocity_mean=(0.0, 0.0))
+    for wrong, only, message in (
+        (replace(right, config=replace(right.config, lr=0.1)), "nll-400-0", "it was trained"),
+        (replace(right, metadata=metadata), "nll-400-0", "it was trained"),
+        (replace(right, metadata=metadata), "tuned-400-0", "needs waterdrop/nll-400-0, which is"),
+    ):
+        write_checkpoint(shipped, wrong)
+        for path in (folder(config) / "metrics" / "waterdrop").glob(f"{only}-*"):
+            path.unlink()
+        with pytest.raises((ValueError, Diverged), match=message):
+            reproduce(replace(config, only=f"waterdrop/{only}"), QUIET)
+
+
+def test_the_package_ships_two_runs_of_laptop(tmp_path: Path) -> None:
+    def shipped(study: Study) -> dict[str, Path]:
+        found = {run.name: run.shipped for run in study.runs() if run.model.chosen is None}
+        return {name: path for name, path in found.items() if path is not None}
+
+    config = ReproduceConfig(preset="laptop", out=tmp_path / "study")
+    assert shipped(study_of(config)) == {
+        f"{data}/nll-400-0": PRETRAINED / f"{data}.safetensors" for data in ("waterdrop", "sand")
+    }
+    assert not shipped(study_of(replace(config, preset="smoke")))
+
+
+def test_what_came_later_is_timed_alone(study: ReproduceConfig, made: ReproduceConfig) -> None:
+    for name in ("training", "data"):
+        shutil.copytree(folder(made) / name, folder(study) / name)
+    shutil.rmtree(folder(study) / "training" / "waterdrop" / "mse-400-0")  # not needed: no sigma
+    path = folder(study) / "metrics" / "waterdrop" / "times.json"
+    before = json.loads(path.read_text())
+    del before["times"]["mse, divergence"], before["times"]["tuned-400, random"]
+    path.write_text(json.dumps(before))
+    again = replace(study, report_only=False, data=("waterdrop",))
+    with pytest.raises(ValueError, match=r"timed with 1 threads, not 2; give --threads 1"):
+        reproduce(replace(again, threads=2), QUIET)
+    reproduce(again, QUIET)
+    after = json.loads(path.read_text())["times"]
+    assert {name: after.pop(name) for name in ("mse, divergence", "tuned-400, random")}
+    assert after == before["times"]
 
 
 def test_a_step_that_was_not_timed_is_told(study: ReproduceConfig) -> None:
@@ -185,6 +308,9 @@ def spoil(path: Path, **changes: object) -> None:
         ("nll-0-fixed.json", {"data_fingerprint": "another"}, "was measured on other data"),
         ("nll-0-fixed.json", {"marks": [5, 20]}, r"was measured at other steps, \[5, 20\]"),
         ("sweep/sweep.json", {"settings": {"edges": 1.0, "tau": [80.0]}}, "was made with tau"),
+        ("sweep-400/sweep.json", {"settings": {"edges": 1.0, "steps": 9}}, "was made with steps"),
+        ("../waterdrop/nll-400-0-fixed-long.json", {"data_fingerprint": "x"}, "on other data"),
+        ("../waterdrop/nll-400-0-fixed-long.json", {"marks": [5, 20]}, "measured at other steps"),
     ],
 )
 def test_what_is_not_of_this_study_is_refused(
