@@ -131,20 +131,20 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
         error = found["mse"]
         return error if math.isfinite(error) else 1e9  # which samplers can compare
 
+    def tell(study: optuna.Study, trial: FrozenTrial) -> None:
+        console.print(
+            f"{len(_complete(study))} of {wanted}: {_described(trial.params)}: MSE@{config.steps} "
+            f"{trial.user_attrs['mse']:.2e}, {trial.user_attrs['edges']:,.0f} edges a step",
+            highlight=False,
+        )
+
     wanted = config.trials or DRAWN
     if config.sampler == "grid":
         wanted = min(math.prod(map(len, space.values())), config.trials or sys.maxsize)
-    while (done := len(_complete(study))) < wanted:
+    while len(_complete(study)) < wanted:
         if config.sampler == "grid":
             study.enqueue_trial(_next_combination(study, space))
-        study.optimize(objective, n_trials=1)
-        trial = study.trials[-1]
-        console.print(
-            f"{done + 1} of {wanted}: {_described(trial.params)}: MSE@{config.steps} "
-            f"{trial.user_attrs.get('mse', math.nan):.2e}, "
-            f"{trial.user_attrs.get('edges', math.nan):,.0f} edges a step",
-            highlight=False,
-        )
+        study.optimize(objective, n_trials=1, callbacks=[tell])
     trials = list(_complete(study).values())
     result = _result(config, trials)
     write_json(config.out / RESULT, result)
