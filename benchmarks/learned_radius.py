@@ -26,6 +26,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
@@ -45,6 +46,7 @@ from adaptgns.graph import adaptive_graph, radius_graph
 from adaptgns.losses import training_loss
 from adaptgns.metrics import edge_counts, position_mse, spearman
 from adaptgns.network import VARIANCE_FLOOR, InteractionLayer, Prediction, mlp
+from adaptgns.periodic import minimum_image
 from adaptgns.policies import Adaptive, Edges, Fixed, Policy, State
 from adaptgns.rollout import steps, to_sigma
 from adaptgns.segment import Graph, at_receivers, at_senders, sum_at_receivers
@@ -401,10 +403,15 @@ def roll(
 
 
 @torch.no_grad()
-def one_step(simulator: Reaching, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
-    """Errors of single steps from true positions under hard and soft gates and the fixed graph,
-    radii from the window one frame earlier, and what the radii go with."""
+def one_step(
+    simulator: Reaching, trajectories: Sequence[Trajectory], *, learned: bool, seed: int
+) -> dict[str, Any]:
+    """Errors of single steps from true positions under the fixed graph, and for a model that has
+    ``learned`` radii, which come from the window one frame earlier, under those with hard and soft
+    gates, dealt out anew, and under one radius for all that gives each frame as many edges; and
+    what the radii go with."""
     simulator.eval()
+    rng = np.random.default_rng(seed)
     errors: dict[str, list[NDArray[np.float32]]] = {}
     seen: dict[str, list[NDArray[np.float32]]] = {}
     for trajectory in trajectories:
@@ -415,16 +422,22 @@ def one_step(simulator: Reaching, trajectories: Sequence[Trajectory]) -> dict[st
             before, window = (
                 true[end - HISTORY : end].transpose(0, 1).contiguous() for end in (frame - 1, frame)
             )
-            base = base_wiring(simulator, before[:, -1].contiguous().numpy(), None)
-            sigma = to_sigma(simulator(before, kind, base.graph))
+            first = base_wiring(simulator, before[:, -1].contiguous().numpy(), None)
+            sigma = to_sigma(simulator(before, kind, first.graph))
             reach = simulator.reach
             base = base_wiring(simulator, window[:, -1].contiguous().numpy(), None)
-            wirings = {
-                "fixed": replace(base, gates=torch.ones(len(base.graph.senders))),
-                "hard": gated_wiring(simulator, window, None, reach, COLD, "straight"),
-                "soft, cold": gated_wiring(simulator, window, None, reach, COLD, "soft"),
-                "soft, warm": gated_wiring(simulator, window, None, reach, WARM, "soft"),
-            }
+            wirings = {"fixed": base}
+            if learned:
+                dealt = reach[torch.from_numpy(rng.permutation(len(reach)))]
+                gated = partial(gated_wiring, simulator, window, None)
+                hard = gated(reach, COLD, "straight")
+                wirings |= {
+                    "hard": hard,
+                    "soft, cold": gated(reach, COLD, "soft"),
+                    "soft, warm": gated(reach, WARM, "soft"),
+                    "dealt anew": gated(dealt, COLD, "straight"),
+                    "one for all": gated(matched(simulator, window, hard), COLD, "straight"),
+                }
             target = simulator.target(window, true[frame])
             for name, wiring in wirings.items():
                 prediction = simulator(window, kind, wiring.graph, gates=wiring.gates)
@@ -441,15 +454,25 @@ def one_step(simulator: Reaching, trajectories: Sequence[Trajectory]) -> dict[st
                 seen.setdefault(name, []).append(values[mobile])
     pooled = {name: np.concatenate(values) for name, values in (seen | errors).items()}
     dim = simulator.metadata.dim
-    return {
-        "mse": {name: float(pooled[name].mean()) / dim for name in errors},
-        "reach": spread(pooled["reach"]),
-        "rank_correlation_of_reach": {
-            "error": spearman(pooled["reach"], pooled["hard"]),
-            **{name: spearman(pooled["reach"], pooled[name]) for name in seen if name != "reach"},
-        },
-        "rank_correlation_of_sigma_and_error": spearman(pooled["sigma"], pooled["hard"]),
-    }
+    found: dict[str, Any] = {"mse": {name: float(pooled[name].mean()) / dim for name in errors}}
+    if learned:
+        reach = pooled.pop("reach")
+        found["reach"] = spread(reach)
+        found["rank_correlation_of_reach"] = {
+            name: spearman(reach, pooled[name]) for name in ("hard", *seen) if name in pooled
+        }
+    return found
+
+
+def matched(simulator: Simulator, window: Tensor, wiring: Wiring) -> Tensor:
+    """``[N]`` times the one radius at which there are as many edges as in ``wiring``."""
+    assert wiring.gates is not None
+    positions = window[:, -1].contiguous().numpy()
+    (senders, receivers), _ = build(simulator, positions, HIGH * simulator.radius, None)
+    across = minimum_image(positions[senders] - positions[receivers], simulator.metadata.box)
+    distance = np.sort(np.linalg.norm(across, axis=1)) / simulator.radius  # self-edges first
+    last = distance[int(wiring.gates.sum()) - 1]
+    return torch.full((len(positions),), float(last) * (1 + 1e-6))
 
 
 def beside(one: dict[str, Any], other: dict[str, Any]) -> dict[str, list[float]]:
@@ -512,8 +535,10 @@ def measure(data: str, options: argparse.Namespace) -> dict[str, Any]:
             policies["dealt anew"] = lambda index, own=simulator: Learned(
                 own, np.random.default_rng([options.seed, index])
             )
-            report["one_step"][name] = one_step(simulator, trajectories)
-            print(name, json.dumps(report["one_step"][name], indent=1))
+        report["one_step"][name] = one_step(
+            simulator, trajectories, learned="learned" in policies, seed=options.seed
+        )
+        print(name, json.dumps(report["one_step"][name]), flush=True)
         for graph, policy in policies.items():
             found = rollouts[f"{name}, {graph}"] = roll(simulator, policy, trajectories)
             means = {key: float(np.mean(each)) for key, each in found.items()}
