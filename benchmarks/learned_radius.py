@@ -15,7 +15,8 @@ while there are more, and falls, below zero if need be, while there are fewer.
 
 All arms start from the pretrained model of the data set and see the same windows, noise and loss,
 for as many steps: on the fixed graph, on the paper's adaptive one, on the learned ones. At test all
-gates are hard. Trained arms lie in ``runs/learned_radius``, and are not trained again.
+gates are hard. Trained arms and what was measured of them lie in ``runs/learned_radius``; what is
+there is not made again.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from torch import Tensor, nn
 
 from adaptgns import fused
 from adaptgns.checkpoint import Checkpoint, read_checkpoint
-from adaptgns.config import HISTORY, to_json
+from adaptgns.config import HISTORY, AdaptiveConfig, to_json
 from adaptgns.data.default import dataset_folder
 from adaptgns.data.trajectories import Trajectories, Trajectory, open_split
 from adaptgns.graph import adaptive_graph, radius_graph
@@ -54,6 +55,7 @@ from adaptgns.simulator import Simulator
 from adaptgns.windows import Batch, Windows, training_batches
 
 Arm = Literal["fixed", "adaptive", "soft", "straight"]
+LEARNED = ("soft", "straight")
 
 LOW, HIGH = 0.8, 1.5
 """What a particle may see, in base radii."""
@@ -216,7 +218,7 @@ class Tuning:
 
     @property
     def learned(self) -> bool:
-        return self.arm in ("soft", "straight")
+        return self.arm in LEARNED
 
     def temperature(self) -> float:
         return WARM * (COLD / WARM) ** min(1.0, self.step / (SETTLED * self.config.steps))
@@ -516,36 +518,57 @@ def trained(
     return tuning.simulator, told
 
 
+def measured(
+    name: str, simulator: Reaching, split: Trajectories, options: argparse.Namespace
+) -> dict[str, Any]:
+    """Single steps and rollouts of the model ``name`` on the graphs that concern it, from its file
+    where it is there."""
+    data = split.path.parent.name.split("-")[0]
+    path = options.runs / f"{data}-{name}-{options.trajectories}.json"
+    if path.exists():
+        kept: dict[str, Any] = json.loads(path.read_text())
+        return kept
+    policies: dict[str, Callable[[int], Policy]] = {"fixed": lambda _: Fixed()}
+    learned = name in LEARNED
+    if name == "pretrained":
+        policies["adaptive"] = lambda _: Adaptive(AdaptiveConfig())
+    elif name == "adaptive":
+        policies = {"adaptive": lambda _: Adaptive(AdaptiveConfig())}
+    elif learned:
+        policies["learned"] = lambda _: Learned(simulator)
+        policies["dealt anew"] = lambda index: Learned(
+            simulator, np.random.default_rng([options.seed, index])
+        )
+    trajectories = [split[index] for index in range(options.trajectories)]
+    found: dict[str, Any] = {
+        "one_step": one_step(simulator, trajectories, learned=learned, seed=options.seed),
+        "rollouts": {},
+    }
+    print(name, json.dumps(found["one_step"]), flush=True)
+    for graph, policy in policies.items():
+        values = found["rollouts"][graph] = roll(simulator, policy, trajectories)
+        means = {key: float(np.mean(each)) for key, each in values.items()}
+        print(f"{name}, {graph}", short(means), flush=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(found))
+    return found
+
+
 def measure(data: str, options: argparse.Namespace) -> dict[str, Any]:
     checkpoint = read_checkpoint(Path(data))
-    split: Trajectories = open_split(dataset_folder(data), "test")
-    trajectories = [split[index] for index in range(options.trajectories)]
-    rule = checkpoint.config.adaptive
-    models: dict[str, Reaching] = {"pretrained": Reaching(checkpoint)}
-    report: dict[str, Any] = {"checkpoint": to_json(checkpoint.config), "arms": {}, "one_step": {}}
+    split = open_split(dataset_folder(data), "test")
+    report: dict[str, Any] = {"checkpoint": to_json(checkpoint.config), "training": {}}
+    models = {"pretrained": Reaching(checkpoint)}
     for arm in options.arms:
-        models[arm], report["arms"][arm] = trained(arm, checkpoint, options)
-    rollouts: dict[str, dict[str, Any]] = {}
+        models[arm], report["training"][arm] = trained(arm, checkpoint, options)
+    report["one_step"], rollouts = {}, {}
     for name, simulator in models.items():
-        policies: dict[str, Callable[[int], Any]] = {"fixed": lambda _: Fixed()}
-        if name in ("pretrained", "adaptive"):
-            policies["adaptive"] = lambda _: Adaptive(rule)
-        if name in ("soft", "straight"):
-            policies["learned"] = lambda _, own=simulator: Learned(own)
-            policies["dealt anew"] = lambda index, own=simulator: Learned(
-                own, np.random.default_rng([options.seed, index])
-            )
-        report["one_step"][name] = one_step(
-            simulator, trajectories, learned="learned" in policies, seed=options.seed
-        )
-        print(name, json.dumps(report["one_step"][name]), flush=True)
-        for graph, policy in policies.items():
-            found = rollouts[f"{name}, {graph}"] = roll(simulator, policy, trajectories)
-            means = {key: float(np.mean(each)) for key, each in found.items()}
-            print(f"{name}, {graph}", short(means), flush=True)
+        found = measured(name, simulator, split, options)
+        report["one_step"][name] = found["one_step"]
+        rollouts |= {f"{name}, {graph}": each for graph, each in found["rollouts"].items()}
+    control = rollouts["fixed, fixed"]
     report["rollouts"] = rollouts
-    control = rollouts.get("fixed, fixed", rollouts["pretrained, fixed"])
-    report["beside_the_fixed_arm_percent"] = {
+    report["percent_beside_the_fixed_arm"] = {
         name: beside(found, control) for name, found in rollouts.items() if found is not control
     }
     return report
@@ -554,14 +577,14 @@ def measure(data: str, options: argparse.Namespace) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", nargs="+", default=["waterdrop", "sand"])
-    parser.add_argument("--arms", nargs="+", default=get_args(Arm), choices=get_args(Arm))
+    parser.add_argument("--arms", nargs="+", default=get_args(Arm), help="fixed among them")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--runs", type=Path, default=Path("runs/learned_radius"))
     parser.add_argument("--steps", type=int, default=1_200)
     parser.add_argument("--lr", type=float, default=3e-4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--gradients", type=int, default=40, help="batches for their noise")
-    parser.add_argument("--trajectories", type=int, default=10)
+    parser.add_argument("--trajectories", type=int, default=8)
     options = parser.parse_args()
     torch.set_num_threads(1)
     report: dict[str, Any] = {"machine": machine()}
