@@ -28,6 +28,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
@@ -78,6 +79,9 @@ WARMUP = 100
 LOG_EVERY = 100
 MARKS = (50, 100, 200)
 ONE_STEP_EVERY = 20
+NEIGHBOURS = ((0, 0), (1, 2), (3, 4), (5, 6), (7, 9))
+TRAINING_EVERY = 8
+"""Training trajectories between those whose radii are looked at"""
 
 
 class Reaching(Simulator):
@@ -477,6 +481,33 @@ def matched(simulator: Simulator, window: Tensor, wiring: Wiring) -> Tensor:
     return torch.full((len(positions),), float(last) * (1 + 1e-6))
 
 
+@torch.no_grad()
+def by_neighbours(simulator: Reaching, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
+    """Radii on true positions by the number of neighbours within the base radius, and how they are
+    correlated with sigma among particles with as many."""
+    reaches, sigmas, counts = [], [], []
+    for trajectory in trajectories:
+        true = torch.from_numpy(trajectory.positions)
+        kind = torch.from_numpy(trajectory.particle_type)
+        for frame in range(HISTORY, HISTORY + MARKS[-1], ONE_STEP_EVERY):
+            window = true[frame - HISTORY : frame].transpose(0, 1).contiguous()
+            graph = base_wiring(simulator, window[:, -1].contiguous().numpy(), None).graph
+            sigmas.append(to_sigma(simulator(window, kind, graph)))
+            reaches.append(simulator.reach.numpy())
+            counts.append(graph.receiver_offsets.diff().numpy() - simulator.config.self_edges)
+    reach, sigma, count = (np.concatenate(each) for each in (reaches, sigmas, counts))
+    found: dict[str, Any] = {"all": spread(reach)}
+    for fewest, most in NEIGHBOURS:
+        chosen = (count >= fewest) & (count <= most)
+        found[f"{fewest} to {most}"] = {
+            "share": float(chosen.mean()),
+            "reach": float(reach[chosen].mean()),
+            "reach_5_95": [float(each) for each in np.percentile(reach[chosen], (5, 95))],
+            "rank_correlation_with_sigma": spearman(reach[chosen], sigma[chosen]),
+        }
+    return found
+
+
 def beside(one: dict[str, Any], other: dict[str, Any]) -> dict[str, list[float]]:
     """The difference of two rollouts' means in percent of the second, and its 95 % interval over
     the trajectories."""
@@ -565,6 +596,12 @@ def measure(data: str, options: argparse.Namespace) -> dict[str, Any]:
     for name, simulator in models.items():
         found = measured(name, simulator, split, options)
         report["one_step"][name] = found["one_step"]
+        if name in LEARNED:
+            train = open_split(dataset_folder(data), "train")
+            report.setdefault("by_neighbours", {})[name] = {
+                "train": by_neighbours(simulator, list(islice(train, 0, None, TRAINING_EVERY))),
+                "test": by_neighbours(simulator, list(islice(split, options.trajectories))),
+            }
         rollouts |= {f"{name}, {graph}": each for graph, each in found["rollouts"].items()}
     control = rollouts["fixed, fixed"]
     report["rollouts"] = rollouts
