@@ -613,7 +613,7 @@ def measure(data: str, options: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", nargs="+", default=["waterdrop", "sand"])
+    parser.add_argument("--data", nargs="+", default=["waterdrop"])
     parser.add_argument("--arms", nargs="+", default=get_args(Arm), help="fixed among them")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--runs", type=Path, default=Path("runs/learned_radius"))
