@@ -178,17 +178,6 @@ DECOUPLED_VARIANTS = (
         variance_ahead=True,
     ),
 )
-WIDER = (
-    replace(MSE, name="mse-denser", title="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)),
-    replace(NLL, name="nll-middle", title="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)),
-)
-BETA_NLL = replace(
-    NLL,
-    name="beta-nll",
-    title="GNS, beta-NLL",
-    loss="beta-nll",
-    policies=("fixed", "adaptive", "random"),
-)
 PAPER_MODELS = (
     replace(MSE, policies=(*MSE.policies, *PRIORS)),
     NLL,
@@ -197,22 +186,24 @@ PAPER_MODELS = (
     *DECOUPLED_VARIANTS,
     TWO_SIDED_NLL,
     *EARLY,
-    *WIDER,
+    replace(MSE, name="mse-denser", title="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)),
+    replace(NLL, name="nll-middle", title="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)),
     ADAPTIVE_NLL,
-    BETA_NLL,
+    replace(
+        NLL,
+        name="beta-nll",
+        title="GNS, beta-NLL",
+        loss="beta-nll",
+        policies=("fixed", "adaptive", "random"),
+    ),
     replace(
         MSE, name="mse-matched", title="GNS, MSE, matched r", radius="matched", policies=("fixed",)
     ),
     TUNED,
 )
 ONE_SEED = tuple(
-    replace(
-        model,
-        title=f"{model.title}, one seed",
-        seeds=1,
-        policies=("fixed", "adaptive"),
-    )
-    for model in (*DECOUPLED_VARIANTS[:2], BETA_NLL)
+    replace(model, title=f"{model.title}, one seed", seeds=1, policies=("fixed", "adaptive"))
+    for model in DECOUPLED_VARIANTS[:2]
 )
 
 

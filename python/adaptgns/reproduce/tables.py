@@ -146,6 +146,13 @@ COMPARISONS: tuple[Comparison, ...] = (
         ("decoupled", "adaptive"),
         ("mse-matched", "fixed"),
     ),
+    *(
+        (f"adaptive or fixed, {title}", (name, "adaptive"), (name, "fixed"))
+        for name, title in (
+            ("decoupled-weight", "decoupled, latents shaped"),
+            ("decoupled-deep", "decoupled, deeper head"),
+        )
+    ),
     (
         "sigma of the next step or of this one",
         ("decoupled-ahead", "adaptive"),
