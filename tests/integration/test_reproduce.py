@@ -282,6 +282,19 @@ def test_a_step_that_was_not_timed_is_told(study: ReproduceConfig) -> None:
         reproduce(study, QUIET)
 
 
+def test_what_another_processor_took_is_marked(study: ReproduceConfig) -> None:
+    path = folder(study) / "metrics" / "waterdrop" / "times.json"
+    content = json.loads(path.read_text())
+    content["times"]["nll, random"]["processor"] = "another"
+    path.write_text(json.dumps(content))
+    reproduce(study, QUIET)
+    report = (folder(study) / "report.md").read_text()
+    marked = [line for line in report.splitlines() if line.startswith("|") and "†" in line]
+    assert marked
+    assert all("| random |" in line for line in marked)
+    assert report.count("† on another processor") == 1
+
+
 @pytest.mark.parametrize(
     ("of", "name", "value"),
     [("training", "lr", 0.5), ("training", "seed", 7), ("rollout", "adaptive", {"tau": 60.0})],

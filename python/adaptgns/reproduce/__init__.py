@@ -9,7 +9,6 @@ from __future__ import annotations
 import fnmatch
 import glob
 import os
-import platform
 import subprocess
 import sys
 import time
@@ -31,7 +30,7 @@ from adaptgns.interruption import interruption
 from adaptgns.reproduce import report
 from adaptgns.reproduce.estimates import seconds
 from adaptgns.reproduce.profiles import PROFILES, ProfileName
-from adaptgns.reproduce.runs import Run, Study
+from adaptgns.reproduce.runs import Run, Study, processor
 
 
 @dataclass(frozen=True)
@@ -237,17 +236,12 @@ def _command(config: ReproduceConfig, run: Run) -> list[str]:
 
 
 def _machine() -> dict[str, object]:
-    processor = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        lines = cpuinfo.read_text().splitlines()
-        models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-        processor = models[0] if models else processor
+    name = processor()
     if torch.cuda.is_available():
-        processor += f" and {torch.cuda.get_device_name()}"
+        name += f" and {torch.cuda.get_device_name()}"
     return {
         "date": date.today().isoformat(),
-        "processor": processor,
+        "processor": name,
         "cores": os.cpu_count(),
         "torch": torch.__version__.split("+")[0],
     }

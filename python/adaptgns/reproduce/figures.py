@@ -231,6 +231,8 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                 cost = series.scalar("edges_per_step").mean()
                 if unit.startswith("milli"):
                     time = data.step_time(series.model, series.policy)
+                    if time["elsewhere"]:
+                        continue
                     cost = time["graph_ms"] + time["model_ms"]
                 ax.errorbar(
                     cost,

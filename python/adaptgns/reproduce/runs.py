@@ -21,6 +21,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import platform
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -364,6 +365,7 @@ class DataSet:
                         kind: float(np.median([getattr(step, kind) for step in taken]))
                         for kind in ("graph_ms", "model_ms", "edges")
                     }
+                    | {"processor": processor()}
                     for name, taken in times.items()
                 },
             },
@@ -374,15 +376,18 @@ class DataSet:
         """What :meth:`time_steps` measured: by model and policy, and on what."""
         return read_json(self.metrics / "times.json")
 
-    def step_time(self, model: Model, policy: PolicyName) -> dict[str, float]:
-        """Of :attr:`times`, those of one model under one policy."""
+    def step_time(self, model: Model, policy: PolicyName) -> dict[str, Any]:
+        """Of :attr:`times`, those of one model under one policy, and whether they are from
+        "elsewhere", another processor than that of the first."""
         name, times = timed_name(model, policy), self.times["times"]
         if name not in times:
             raise StudyError(
                 f"{self.metrics / 'times.json'}: has no step of {name}; the command without "
                 "--report-only times it"
             )
-        return times[name]  # type: ignore[no-any-return]
+        first = next(iter(times.values()))
+        elsewhere = times[name].get("processor") != first.get("processor")
+        return {**times[name], "elsewhere": elsewhere}
 
     def pass_gate(self, console: Console) -> None:
         """Find how long the fixed graph's baseline must train until it does not clump."""
@@ -740,6 +745,16 @@ def write_snapshot(rollouts: Path, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as partial, partial.open("wb") as stream:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+
+
+def processor() -> str:
+    """Its name, as the system tells it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
 
 
 def read_json(path: Path) -> dict[str, Any]:

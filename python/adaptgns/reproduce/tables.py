@@ -39,6 +39,9 @@ PAPER_RESULTS = {
 }
 """Edges per step and MSE@200, measured on other data"""
 
+ELSEWHERE = "†"
+"""Stands at what another processor took"""
+
 Comparison = tuple[str, tuple[str, PolicyName], tuple[str, PolicyName]]
 COMPARISONS: tuple[Comparison, ...] = (
     ("adaptive or fixed graph, same model", ("nll", "adaptive"), ("nll", "fixed")),
@@ -237,8 +240,11 @@ def _rollouts(results: Results, data: DataSet) -> Table:
     mark, marks = results.study.last_mark, results.study.profile.marks
     rows = []
     where = str((data.metrics / "times.json").relative_to(results.study.out).as_posix())
+    mixed = False
     for series in results.of(data.name):
         time = data.step_time(series.model, series.policy)
+        mixed = mixed or time["elsewhere"]
+        sign = ELSEWHERE if time["elsewhere"] else ""
         true = series.curve("edges_within_radius_true").mean()
         predicted = series.curve("edges_within_radius").mean()
         rows.append(
@@ -254,8 +260,8 @@ def _rollouts(results: Results, data: DataSet) -> Table:
                     _number(true, ",.0f"),
                     _number(predicted / true, ".2f"),
                     _interval(series.estimate(f"clumping@{mark}"), ".2f"),
-                    f"{time['graph_ms']:.2f}",
-                    f"{time['model_ms']:.2f}",
+                    f"{time['graph_ms']:.2f}{sign}",
+                    f"{time['model_ms']:.2f}{sign}",
                 ],
                 [*series.files, where],
             )
@@ -297,7 +303,12 @@ def _rollouts(results: Results, data: DataSet) -> Table:
         "clump. Milliseconds of a step are medians of all models and policies in turns, of those "
         "that the study got later in turns among themselves, on true "
         f"positions of one trajectory of {data.times['particles']:,} particles, "
-        f"{data.times['threads']} threads.",
+        f"{data.times['threads']} threads"
+        + (
+            f"; {ELSEWHERE} on another processor, to be compared among themselves."
+            if mixed
+            else "."
+        ),
     )
 
 
