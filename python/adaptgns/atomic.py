@@ -71,7 +71,7 @@ def replace_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def write_json(path: Path, content: dict[str, Any]) -> None:
+def write_json(path: Path, content: dict[str, Any] | list[Any]) -> None:
     """Write ``content`` with six significant digits, whole or not at all."""
     replace_text(path, json.dumps(json_types(content, digits=6), allow_nan=False) + "\n")
 

@@ -531,3 +531,15 @@ def test_differences_are_paired(made: ReproduceConfig) -> None:
     assert found.mean == pytest.approx(
         one.estimate("mse@10").mean - other.estimate("mse@10").mean, rel=1e-6, abs=1e-12
     )
+
+
+def test_every_machine_that_a_study_was_made_on_is_named(study: ReproduceConfig) -> None:
+    path = folder(study) / "machine.json"
+    (here,) = json.loads(path.read_text())
+    other = {**here, "processor": "another one", "date": "2026-01-01"}
+    for content, names in (([other, here], [other, here]), (other, [other])):  # older: one alone
+        path.write_text(json.dumps(content))
+        reproduce(study, QUIET)
+        line = (folder(study) / "report.md").read_text().splitlines()[2]
+        assert [f"on {m['date']} on {m['processor']}" in line for m in names] == [True] * len(names)
+        assert line.count("torch") == len(names)

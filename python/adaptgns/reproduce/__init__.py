@@ -30,7 +30,7 @@ from adaptgns.interruption import interruption
 from adaptgns.reproduce import report
 from adaptgns.reproduce.estimates import seconds
 from adaptgns.reproduce.profiles import PROFILES, ProfileName
-from adaptgns.reproduce.runs import Run, Study, processor
+from adaptgns.reproduce.runs import MACHINES, Run, Study, processor, read_machines
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def make(config: ReproduceConfig, study: Study, runs: Sequence[Run], console: Co
             data.describe_long()
     failed = (one_by_one if config.jobs == 1 else in_processes)(config, todo, console)
     if todo:
-        write_json(study.out / "machine.json", _machine())
+        _note_machine(study)
     if failed:
         raise RuntimeError(
             f"{len(failed)} runs failed: {', '.join(failed)}. Repeat the command to go on"
@@ -233,6 +233,14 @@ def _command(config: ReproduceConfig, run: Run) -> list[str]:
             str(study.threads),
         ),
     ]
+
+
+def _note_machine(study: Study) -> None:
+    """Add this machine, as of today, to those that the study was made on."""
+    here = _machine()
+    known = read_machines(study.out) if (study.out / MACHINES).exists() else []
+    others = [machine for machine in known if {**machine, "date": None} != {**here, "date": None}]
+    write_json(study.out / MACHINES, [*others, here])
 
 
 def _machine() -> dict[str, object]:

@@ -13,7 +13,7 @@ from adaptgns.atomic import replace_text, write_json
 from adaptgns.reproduce import figures
 from adaptgns.reproduce.profiles import PRIORS
 from adaptgns.reproduce.results import Results
-from adaptgns.reproduce.runs import Study, read_json
+from adaptgns.reproduce.runs import Study, read_json, read_machines
 from adaptgns.reproduce.tables import Row, Table, tables
 from adaptgns.sweep import HEAT_MAP
 
@@ -124,13 +124,17 @@ def _markdown(study: Study, made: list[Table], images: list[Path]) -> str:
 
 def _made(study: Study) -> str:
     """When, where and at what size."""
-    machine = read_json(study.out / "machine.json")
+    machines = [
+        f"on {machine['date']} on {machine['processor']}, {machine['cores']} cores, torch "
+        f"{machine['torch']}"
+        for machine in read_machines(study.out)
+    ]
     profile = study.profile
     count = "all" if profile.trajectories is None else f"the first {profile.trajectories}"
     gate = "" if profile.gate else " No gate: the ratios tell how far the models clump."
     return (
-        f"Made on {machine['date']} with `python -m adaptgns.reproduce --preset {study.preset}` on "
-        f"{machine['processor']}, {machine['cores']} cores, torch {machine['torch']}. "
+        f"Made with `python -m adaptgns.reproduce --preset {study.preset}` "
+        f"{', and '.join(machines)}. "
         f"{len(profile.seeds)} seeds, {profile.base.steps:,} training steps, {count} test "
         f"trajectories.{gate}"
     )

@@ -78,6 +78,8 @@ from adaptgns.train import train
 Split = Literal["valid", "test", "long"]
 """What is rolled out: a part of the data, or the trajectories of the long rollouts"""
 
+MACHINES = "machine.json"
+"""What a study was made on"""
 SNAPSHOTS = (1, 10, 50, 100)
 """Steps whose frames are kept for the figures"""
 EVERY = 10
@@ -745,6 +747,13 @@ def write_snapshot(rollouts: Path, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as partial, partial.open("wb") as stream:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+
+
+def read_machines(study: Path) -> list[dict[str, Any]]:
+    """Those that the study in this folder was made on, each as of its last day; of older ones the
+    file holds the last alone."""
+    content: Any = read_json(study / MACHINES)
+    return content if isinstance(content, list) else [content]
 
 
 def processor() -> str:
