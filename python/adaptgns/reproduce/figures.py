@@ -240,6 +240,8 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                     yerr=[[error.mean - error.low], [error.high - error.mean]],
                     color=colour(series),
                     marker=MARKERS[series.policy],
+                    # Hollow, that models trained for longer stand out beside those of their colour.
+                    markerfacecolor="none" if series.model.share > 1 else None,
                     linestyle="none",
                     capsize=2,
                     label=series_label(series),

@@ -23,7 +23,8 @@ CAPTIONS = {
     "sigma": "Figure 2: where the model is unsure.",
     "steps": "Figure 3: edges and errors at every step; bands reach from the lowest to the highest "
     "seed.",
-    "pareto": "What the error costs, in edges and in time, with its 95 % interval.",
+    "pareto": "What the error costs, in edges and in time, with its 95 % interval; hollow: models "
+    "trained for longer.",
     "reliability": "Predicted and measured errors by deciles, a line for each seed.",
     "long": "Long rollouts: the error, and edges within the data's radius, predicted over true.",
     "clouds": "Kinetic energy, and the distance between predicted and true clouds.",
