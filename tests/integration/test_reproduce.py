@@ -416,7 +416,7 @@ def test_the_readme_gets_the_tables_between_its_marks(
     # Those are for the report alone.
     for left_out in ("30 % of the steps", "two-pass", "divergence"):
         assert left_out not in text
-    assert re.search(r"Made on \d{4}-\d\d-\d\d .* cores", text)
+    assert re.search(r"Made with .* on \d{4}-\d\d-\d\d on .* cores, torch", text)
     readme.write_text("no marks")
     with pytest.raises(ValueError, match="holds no <!-- results -->"):
         write_into(study_of(study), readme)
