@@ -149,12 +149,15 @@ COMPARISONS: tuple[Comparison, ...] = (
         ("decoupled", "adaptive"),
         ("mse-matched", "fixed"),
     ),
-    *(
-        (f"adaptive or fixed, {title}", (name, "adaptive"), (name, "fixed"))
-        for name, title in (
-            ("decoupled-weight", "decoupled, latents shaped"),
-            ("decoupled-deep", "decoupled, deeper head"),
-        )
+    (
+        "adaptive or fixed, decoupled, latents shaped",
+        ("decoupled-weight", "adaptive"),
+        ("decoupled-weight", "fixed"),
+    ),
+    (
+        "adaptive or fixed, decoupled, deeper head",
+        ("decoupled-deep", "adaptive"),
+        ("decoupled-deep", "fixed"),
     ),
     (
         "sigma of the next step or of this one",
