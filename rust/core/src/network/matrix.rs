@@ -84,12 +84,28 @@ impl<'a> Matrix<'a> {
     /// columns one lies across the lines of the cache.
     pub fn copy_to(&self, out: &mut [f32], stride: usize) {
         const SQUARE: usize = 16;
-        for row in (0..self.rows).step_by(SQUARE) {
-            for column in (0..self.columns).step_by(SQUARE) {
-                for i in row..self.rows.min(row + SQUARE) {
-                    for j in column..self.columns.min(column + SQUARE) {
-                        out[i * stride + j] =
-                            self.data[i * self.row_stride + j * self.column_stride];
+        let Self {
+            rows,
+            columns,
+            row_stride,
+            column_stride,
+            ..
+        } = *self;
+        if rows == 0 || columns == 0 {
+            return;
+        }
+        assert!(self.extent() <= self.data.len());
+        assert!(columns <= stride && (rows - 1) * stride + columns <= out.len());
+        let (data, out) = (self.data.as_ptr(), out.as_mut_ptr());
+        for row in (0..rows).step_by(SQUARE) {
+            for column in (0..columns).step_by(SQUARE) {
+                for i in row..rows.min(row + SQUARE) {
+                    for j in column..columns.min(column + SQUARE) {
+                        // SAFETY: row i and column j are inside both, as asserted.
+                        unsafe {
+                            *out.add(i * stride + j) =
+                                *data.add(i * row_stride + j * column_stride);
+                        }
                     }
                 }
             }
@@ -138,7 +154,9 @@ vectorized! {
         b: Matrix<'_>,
         end: End<'_>,
     ) {
-        tiles::<Lanes, { <Lanes as Vector>::TILE }, 2>(out, stride, start, a, b, end)
+        tiles::<Lanes, { <Lanes as Vector>::TILE.0 }, { <Lanes as Vector>::TILE.1 }>(
+            out, stride, start, a, b, end,
+        )
     }
 }
 
@@ -154,7 +172,7 @@ struct Task<'a> {
     end: End<'a>,
 }
 
-/// Tile by tile of `R` rows, at most 8, and `C` vectors.
+/// Tile by tile of `R` rows, at most 8, and `C` vectors, at most 4.
 #[inline(always)]
 fn tiles<V: Vector, const R: usize, const C: usize>(
     out: &mut [f32],
@@ -194,6 +212,10 @@ fn tiles<V: Vector, const R: usize, const C: usize>(
         while column + C * V::LANES <= columns {
             strip::<V, R, C>(task, column);
             column += C * V::LANES;
+        }
+        if C > 2 && column + 2 * V::LANES <= columns {
+            strip::<V, R, 2>(task, column);
+            column += 2 * V::LANES;
         }
         while column + V::LANES <= columns {
             strip::<V, R, 1>(task, column);

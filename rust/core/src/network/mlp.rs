@@ -72,7 +72,7 @@ impl<'a> Linear<'a> {
     }
 
     /// `[outputs, inputs]`, what gradients are multiplied with on their way back.
-    fn backward(&self) -> Factor<'_> {
+    pub(super) fn backward(&self) -> Factor<'_> {
         Factor {
             weight: Matrix::new(self.weight, self.inputs()),
             precision: self.precision,
@@ -136,6 +136,14 @@ impl Factor<'_> {
         match self.precision {
             Precision::Float32 => product(out, stride, start, a, self.numbers(), end),
             Precision::Bf16 => bf16::product(out, stride, start, a, self.rounded(), end),
+        }
+    }
+
+    /// Makes the copy that products take, which the first of them would make else, while others wait.
+    pub fn copy(&self) {
+        match self.precision {
+            Precision::Float32 => _ = self.numbers(),
+            Precision::Bf16 => _ = self.rounded(),
         }
     }
 

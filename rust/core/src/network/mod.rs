@@ -29,15 +29,17 @@ pub use mlp::{Linear, Mlp, Norm, Precision};
 use crate::threads::{self, Team, Threads};
 use buffer::Buffer;
 use matrix::{End, Matrix, Start};
-use mlp::{Input, Kept, KeptMut, split};
+use mlp::{Factor, Input, Kept, KeptMut, split};
 
 /// Rows that go through a perceptron at once.
-const BLOCK: usize = 64;
+const BLOCK: usize = 96;
 /// The fewest nodes and edges worth a part of their own.
 const NODES: usize = 64;
 const EDGES: usize = 256;
 /// The most parts; each has its own sum of the gradients of the parameters.
 const PARTS: usize = 64;
+/// Many parts are a multiple of these, so that few threads have as many each.
+const EVEN: usize = 4;
 
 /// One message-passing step, or with no `edge` one residual perceptron per node.
 pub struct Layer<'a> {
@@ -198,6 +200,7 @@ impl Network<'_> {
 
         let mut layers = Vec::new();
         for layer in self.layers {
+            copy_weights(team, &layer, Linear::forward);
             let mut node = rows(&layer.node, count);
             let mut incoming = Buffer::default();
             let mut edge = None;
@@ -306,6 +309,7 @@ impl Network<'_> {
         let mut to_edges = Buffer::zeros(edges.len());
         let parts = features.edges.map(|(_, graph)| graph.parts());
         for (layer, tape) in self.layers.into_iter().zip(&mut tape.layers).rev() {
+            copy_weights(team, &layer, Linear::backward);
             pass.undo(&layer.node, &mut tape.node, &mut nodes);
             let gradient = Buffer::copy(&to_nodes);
             let mut to_incoming = Buffer::zeros(tape.incoming.len());
@@ -404,12 +408,16 @@ impl Network<'_> {
 impl Edges<'_> {
     /// Parts of whole receivers with about as many edges each.
     fn parts(&self) -> Vec<Part> {
-        let least = EDGES.max(self.senders.len().div_ceil(PARTS));
+        let most = self
+            .senders
+            .len()
+            .div_ceil(share(self.senders.len(), EDGES))
+            .max(1);
         let mut parts = Vec::new();
         let (mut node, mut edge) = (0, 0);
         for (next, &end) in self.offsets.iter().enumerate().skip(1) {
             let end = end as usize;
-            if end - edge >= least || next == self.offsets.len() - 1 {
+            if end >= (parts.len() + 1) * most || next == self.offsets.len() - 1 {
                 parts.push(Part {
                     nodes: node..next,
                     edges: edge..end,
@@ -421,9 +429,19 @@ impl Edges<'_> {
     }
 }
 
-/// How many nodes each part has: whole tiles of the products.
+/// Among how many parts `count` rows are shared out that are worth one by `least`.
+fn share(count: usize, least: usize) -> usize {
+    let parts = (count / least).clamp(1, PARTS);
+    if parts < EVEN {
+        parts
+    } else {
+        parts / EVEN * EVEN
+    }
+}
+
+/// How many nodes each part has.
 fn lengths(count: usize) -> Vec<usize> {
-    let size = NODES.max(count.div_ceil(PARTS)).next_multiple_of(8);
+    let size = count.div_ceil(share(count, NODES)).max(1);
     (0..count)
         .step_by(size)
         .map(|start| size.min(count - start))
@@ -716,6 +734,14 @@ impl Pass<'_> {
             sum
         })
     }
+}
+
+/// Copies the weights of `layer` for the products of a `way`, on all threads: one that waits for
+/// another's copy sleeps for longer than that takes.
+fn copy_weights<'n>(team: &Team, layer: &Layer<'n>, way: for<'l> fn(&'l Linear<'n>) -> Factor<'l>) {
+    let mlps = layer.edge.iter().chain([&layer.node]);
+    let linears = mlps.flat_map(|mlp| &mlp.linears).collect();
+    team.map(linears, |linear| way(linear).copy());
 }
 
 /// Adds its message to every edge, and the sum of a receiver's messages to `incoming`.

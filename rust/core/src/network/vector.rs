@@ -3,8 +3,8 @@
 /// Some numbers in one register. Only for processors that have such.
 pub(super) trait Vector: Copy {
     const LANES: usize;
-    /// How many rows of two of them, with what a product needs besides, fill the registers.
-    const TILE: usize;
+    /// How many rows of how many of them, with what a product needs besides, fill the registers.
+    const TILE: (usize, usize);
     /// # Safety
     /// The processor has such registers; `LANES` numbers are at `from`.
     unsafe fn load(from: *const f32) -> Self;
@@ -49,7 +49,7 @@ pub(super) trait Vector: Copy {
 
 impl<const N: usize> Vector for [f32; N] {
     const LANES: usize = N;
-    const TILE: usize = 4;
+    const TILE: (usize, usize) = (4, 2);
 
     #[inline(always)]
     unsafe fn load(from: *const f32) -> Self {
@@ -88,12 +88,12 @@ impl<const N: usize> Vector for [f32; N] {
 #[cfg(target_arch = "x86_64")]
 macro_rules! vector {
     (
-        $kind:ident, $lanes:literal, $tile:literal, $load:ident, $store:ident, $all:ident, $add_product:ident,
+        $kind:ident, $lanes:literal, $tile:expr, $load:ident, $store:ident, $all:ident, $add_product:ident,
         $max:ident, |$self:ident, $positive:ident| $where_positive:expr, $compare:ident
     ) => {
         impl Vector for std::arch::x86_64::$kind {
             const LANES: usize = $lanes;
-            const TILE: usize = $tile;
+            const TILE: (usize, usize) = $tile;
 
             #[inline(always)]
             unsafe fn load(from: *const f32) -> Self {
@@ -140,11 +140,11 @@ macro_rules! vector {
 }
 #[cfg(target_arch = "x86_64")]
 vector! {
-    __m512, 16, 8, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_set1_ps, _mm512_fmadd_ps, _mm512_max_ps,
+    __m512, 16, (6, 4), _mm512_loadu_ps, _mm512_storeu_ps, _mm512_set1_ps, _mm512_fmadd_ps, _mm512_max_ps,
     |self, positive| _mm512_maskz_mov_ps(positive, self), _mm512_cmp_ps_mask
 }
 #[cfg(target_arch = "x86_64")]
 vector! {
-    __m256, 8, 6, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_set1_ps, _mm256_fmadd_ps, _mm256_max_ps,
+    __m256, 8, (6, 2), _mm256_loadu_ps, _mm256_storeu_ps, _mm256_set1_ps, _mm256_fmadd_ps, _mm256_max_ps,
     |self, positive| _mm256_and_ps(positive, self), _mm256_cmp_ps
 }
