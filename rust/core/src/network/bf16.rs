@@ -24,6 +24,48 @@ vectorized! {
             *x = rounded(*x);
         }
     }
+
+    /// `numbers`, rounded to bf16.
+    fn pack(numbers: &[f32], out: &mut [u16]) {
+        for (o, &x) in out.iter_mut().zip(numbers) {
+            *o = (rounded(x).to_bits() >> 16) as u16;
+        }
+    }
+
+    /// What [`pack`] has packed.
+    fn unpack(packed: &[u16], out: &mut [f32]) {
+        for (o, &x) in out.iter_mut().zip(packed) {
+            *o = f32::from_bits(u32::from(x) << 16);
+        }
+    }
+}
+
+/// Numbers as they lie in memory from step to step: in float32, or in bf16 and half of it.
+pub(super) trait Stored: Copy + Send {
+    /// `stored` to be worked on: where it lies, or from here to [`Self::put`] in `room`.
+    fn take<'r>(stored: &'r mut [Self], room: &'r mut [f32]) -> &'r mut [f32];
+    /// `stored` becomes what `room` holds, if that was worked on.
+    fn put(stored: &mut [Self], room: &[f32]);
+}
+
+impl Stored for f32 {
+    fn take<'r>(stored: &'r mut [f32], _: &'r mut [f32]) -> &'r mut [f32] {
+        stored
+    }
+
+    fn put(_: &mut [f32], _: &[f32]) {}
+}
+
+impl Stored for u16 {
+    fn take<'r>(stored: &'r mut [u16], room: &'r mut [f32]) -> &'r mut [f32] {
+        let room = &mut room[..stored.len()];
+        unpack(stored, room);
+        room
+    }
+
+    fn put(stored: &mut [u16], room: &[f32]) {
+        pack(&room[..stored.len()], stored);
+    }
 }
 
 /// The right factor of a product.

@@ -94,6 +94,13 @@ impl Buffer {
         buffer
     }
 
+    /// Its memory as numbers of half the size, of which it has room for `length`.
+    pub fn halves(&mut self, length: usize) -> &mut [u16] {
+        assert!(length <= 2 * self.length);
+        // SAFETY: so many lie there, of weaker alignment; any bits are a number.
+        unsafe { slice::from_raw_parts_mut(self.memory.start.as_ptr().cast(), length) }
+    }
+
     pub fn copy(data: &[f32]) -> Self {
         let mut buffer = Self::any(data.len());
         buffer.copy_from_slice(data);

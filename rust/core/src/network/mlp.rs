@@ -232,6 +232,11 @@ impl<'a> Mlp<'a> {
             && kept.inverse_std.len() == normed
     }
 
+    /// What its products are rounded to.
+    pub(super) fn precision(&self) -> Precision {
+        self.linears[0].precision
+    }
+
     pub(super) fn hidden_widths(&self) -> impl Iterator<Item = usize> {
         self.linears[..self.linears.len() - 1]
             .iter()
@@ -411,11 +416,11 @@ impl<D: DerefMut<Target = [f32]>> Kept<D> {
 }
 
 /// Cuts the data of `rows` rows into parts of `lengths` rows.
-pub(super) fn split<'d>(
-    mut data: &'d mut [f32],
+pub(super) fn split<'d, T>(
+    mut data: &'d mut [T],
     lengths: &[usize],
     rows: usize,
-) -> Vec<&'d mut [f32]> {
+) -> Vec<&'d mut [T]> {
     let width = data.len().checked_div(rows).unwrap_or(0);
     lengths
         .iter()
