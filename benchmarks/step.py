@@ -140,9 +140,12 @@ def medians(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, floa
 
 
 def peak_memory(size: str, form: str, device: str) -> float:
-    """MiB that a training step takes, in a process of its own."""
+    """MiB that a training step takes, the median of three processes that take one."""
     command = [sys.executable, __file__, "--device", device, "--memory", size, form]
-    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return statistics.median(
+        float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        for _ in range(3)
+    )
 
 
 def print_memory(size: str, form: str, device: str) -> None:

@@ -199,6 +199,15 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
     simulator.network.precision = config.precision
     split = open_data(checkpoint, config.data, config.split, console)
     count = len(split) if config.trajectories is None else min(config.trajectories, len(split))
+    if config.steps is not None:
+        short = np.count_nonzero(split.lengths[:count] < HISTORY + config.steps)
+        if short:
+            console.print(
+                f"note: {short} of {count} trajectories end before step {config.steps}, and their "
+                "rollouts with them",
+                highlight=False,
+                soft_wrap=True,
+            )
     network = "GNS" if simulator.config.edges else "MLP"
     settings = {
         **to_json(config),

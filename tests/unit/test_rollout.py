@@ -296,6 +296,16 @@ def test_what_the_model_takes_otherwise_is_told(
     assert "periodic is (True, False)" in capsys.readouterr().err
 
 
+def test_a_horizon_behind_the_end_of_the_data_is_told(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--checkpoint", "waterdrop", "--data", str(drops), "--trajectories", "1"]
+    for steps_asked, told in (("35", True), ("34", False)):
+        main([*options, "--steps", steps_asked, "--out", str(tmp_path / f"{steps_asked}.h5")])
+        ends = "1 of 1 trajectories end before step 35" in capsys.readouterr().out
+        assert ends == told
+
+
 def test_a_file_that_is_there_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rollout.h5"
     out.write_bytes(b"dear")

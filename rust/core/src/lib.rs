@@ -6,6 +6,7 @@ mod error;
 pub mod graph;
 pub mod mpm;
 pub mod network;
+mod pages;
 pub mod threads;
 
 pub use error::Error;

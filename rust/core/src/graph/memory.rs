@@ -6,6 +6,7 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::Error;
+use crate::pages;
 use crate::threads::Team;
 
 /// Bytes that an edge takes while a graph is assembled: two 64-bit indices in the
@@ -117,21 +118,6 @@ pub(super) fn room<T>(count: usize) -> Vec<T> {
 pub(super) fn reserve<T>(count: usize) -> Option<Vec<T>> {
     let mut room = Vec::<T>::new();
     room.try_reserve_exact(count).ok()?;
-    #[cfg(target_os = "linux")]
-    {
-        const LARGE: usize = 1 << 22;
-        const PAGE: usize = 1 << 12;
-        let bytes = count * size_of::<T>();
-        if bytes >= LARGE {
-            let start = room.as_mut_ptr().cast::<libc::c_void>();
-            let skipped = start.align_offset(PAGE);
-            // SAFETY: the range lies inside the allocation, and the advice changes nothing
-            // that is in it; where it is not taken, nothing is lost.
-            unsafe {
-                let whole = (bytes - skipped) / PAGE * PAGE;
-                libc::madvise(start.add(skipped), whole, libc::MADV_HUGEPAGE);
-            }
-        }
-    }
+    pages::ask_for_large(room.as_mut_ptr(), count);
     Some(room)
 }

@@ -9,6 +9,8 @@ use std::ptr::NonNull;
 use std::slice;
 use std::sync::{Mutex, MutexGuard};
 
+use crate::pages;
+
 /// The most numbers that wait for use (1 GiB); what goes beyond is freed.
 const MOST: usize = 1 << 28;
 
@@ -42,7 +44,9 @@ impl Memory {
         } else {
             // SAFETY: the layout has bytes, and zeros are numbers.
             let start = unsafe { System.alloc_zeroed(layout) };
-            NonNull::new(start.cast()).unwrap_or_else(|| handle_alloc_error(layout))
+            let start = NonNull::new(start.cast()).unwrap_or_else(|| handle_alloc_error(layout));
+            pages::ask_for_large(start.as_ptr(), capacity);
+            start
         };
         Self { start, capacity }
     }
