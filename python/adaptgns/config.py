@@ -147,8 +147,8 @@ class RolloutConfig:
     device: Device = "auto"
     """auto: a GPU where there is one."""
     precision: Precision = "float32"
-    """bf16: the factors of products up to the heads in 16 bits, all else in 32; for processors with
-    instructions for it, and GPUs."""
+    """bf16: the edges' latents and the factors of products up to the heads in 16 bits, all else in
+    32; for processors with instructions for it, and GPUs."""
 
     def __post_init__(self) -> None:
         _require(
