@@ -13,14 +13,15 @@ import pytest
 from rich.console import Console
 
 from adaptgns.checkpoint import BEST, LAST, PRETRAINED, read_checkpoint, write_checkpoint
+from adaptgns.config import PolicyName
 from adaptgns.data.trajectories import open_split
 from adaptgns.fit import Diverged
 from adaptgns.reproduce import ReproduceConfig, main, reproduce, study_of
 from adaptgns.reproduce.estimates import seconds
-from adaptgns.reproduce.profiles import PROFILES
+from adaptgns.reproduce.profiles import PROFILES, Model
 from adaptgns.reproduce.report import MARKERS, write_into
 from adaptgns.reproduce.results import Estimate, Results, estimate
-from adaptgns.reproduce.runs import Run, Study
+from adaptgns.reproduce.runs import DataSet, Run, Study, StudyError, matched_radius
 
 QUIET = Console(quiet=True)
 FIGURES = ("statistics", "graphs", "sigma", "steps", "long", "pareto", "reliability", "clouds")
@@ -457,6 +458,31 @@ def test_a_dry_run_tells_what_the_gate_may_cost(
     assert not capsys.readouterr().out
     reproduce(config, Console(width=200))
     assert "12 steps, or twice as many, and so on up to 48, until" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("edges", "share"), [(90.0, 0.0), (100.0, 0.0), (130.0, 0.3), (200.0, 1.0), (300.0, 1.0)]
+)
+def test_the_matched_radius_is_interpolated_in_its_square(
+    edges: float, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = {
+        ("mse", "fixed"): 100.0,
+        ("mse-denser", "fixed"): 200.0,
+        ("decoupled-weight", "adaptive"): edges,
+    }
+
+    def valid_edges(_data: DataSet, model: Model, _seed: int, policy: PolicyName) -> float:
+        return found[model.name, policy]
+
+    monkeypatch.setattr("adaptgns.reproduce.runs.valid_edges", valid_edges)
+    sand = study_of(ReproduceConfig(preset="laptop")).sets["sand"]
+    radius = matched_radius(sand, "decoupled-weight", 0, 0.02)
+    widest = (0.019 / 0.015) ** 2
+    assert (radius / 0.02) ** 2 == pytest.approx(1 + share * (widest - 1), rel=1e-4)
+    smoke = study_of(ReproduceConfig(preset="smoke")).sets["sand"]
+    with pytest.raises(StudyError, match="no model with the denser graph"):
+        matched_radius(smoke, "nll", 0, 0.02)
 
 
 def test_several_at_a_time(made: ReproduceConfig, tmp_path: Path) -> None:

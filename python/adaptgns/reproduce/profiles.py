@@ -43,8 +43,10 @@ class Model:
     loss: Loss
     edges: bool = True
     radius: float | Literal["matched"] = 1.0
-    """Times the radius of the data; matched: that whose graph has as many edges as the adaptive
-    one in rollouts of the validation split, interpolated in the radius squared."""
+    """Times the radius of the data; matched: that whose graph has as many edges as the adaptive one
+    of the model ``matches`` in rollouts of the validation split, interpolated in the radius
+    squared."""
+    matches: str = "nll"
     graph: Literal["base", "adaptive", "two-sided"] = "base"
     variance_weight: float = 0.0
     variance_ahead: bool = False
@@ -218,7 +220,21 @@ def one_seed(model: Model) -> Model:
 
 
 ONE_SEED = tuple(
-    map(one_seed, (*DECOUPLED_VARIANTS, DENSER_MSE, MIDDLE_NLL, BETA_NLL, MATCHED_MSE))
+    map(
+        one_seed,
+        (
+            *DECOUPLED_VARIANTS,
+            DENSER_MSE,
+            MIDDLE_NLL,
+            BETA_NLL,
+            replace(
+                MATCHED_MSE,
+                name="mse-matched-decoupled",
+                title="GNS, MSE, r of as many edges as adaptive decoupled, latents shaped",
+                matches="decoupled-weight",
+            ),
+        ),
+    )
 )
 
 

@@ -498,7 +498,7 @@ class Run:
         radius = float(self.data.described["radius"])
         config = self._config(radius)
         if self.model.radius == "matched":
-            matched = matched_radius(self.data, self.seed, radius)
+            matched = matched_radius(self.data, self.model.matches, self.seed, radius)
             config = replace(config, model=replace(config.model, radius=matched))
         return config
 
@@ -682,15 +682,17 @@ def timed_name(model: Model, policy: PolicyName) -> str:
     return f"{model.timed_as or model.name}, {policy}"
 
 
-def matched_radius(data: DataSet, seed: int, radius: float) -> float:
-    """The radius of the fixed graph that has as many edges as the adaptive one in rollouts of the
-    validation split, interpolated in the radius squared between two models' rollouts."""
-    denser = next((m for m in data.study.profile.models if m.radius == DENSER), None)
+def matched_radius(data: DataSet, name: str, seed: int, radius: float) -> float:
+    """The radius of the fixed graph that has as many edges as the adaptive one of the model
+    ``name`` in rollouts of the validation split, interpolated in the radius squared between two
+    models' rollouts."""
+    profile = data.study.profile
+    denser = next((m for m in profile.models if m.radius == DENSER), None)
     if denser is None:
-        raise StudyError("mse-matched: the profile has no model with the denser graph")
+        raise StudyError("matched radius: the profile has no model with the denser graph")
     sparse = valid_edges(data, MSE, seed, "fixed")
     dense = valid_edges(data, denser, seed, "fixed")
-    adaptive = valid_edges(data, NLL, seed, "adaptive")
+    adaptive = valid_edges(data, profile.model(name), seed, "adaptive")
     share = (adaptive - sparse) / (dense - sparse) if dense != sparse else 0.0
     squared = radius**2 * (1 + min(max(share, 0.0), 1.0) * (DENSER**2 - 1))
     return six_digits(math.sqrt(squared))

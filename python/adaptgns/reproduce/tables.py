@@ -150,6 +150,11 @@ COMPARISONS: tuple[Comparison, ...] = (
         ("mse-matched", "fixed"),
     ),
     (
+        "adaptive decoupled, latents shaped, or MSE at matched edges",
+        ("decoupled-weight", "adaptive"),
+        ("mse-matched-decoupled", "fixed"),
+    ),
+    (
         "adaptive or fixed, decoupled, latents shaped",
         ("decoupled-weight", "adaptive"),
         ("decoupled-weight", "fixed"),
