@@ -461,9 +461,9 @@ def test_a_dry_run_tells_what_the_gate_may_cost(
 
 
 @pytest.mark.parametrize(
-    ("edges", "share"), [(90.0, 0.0), (100.0, 0.0), (130.0, 0.3), (200.0, 1.0), (300.0, 1.0)]
+    ("edges", "share"), [(70.0, -0.3), (100.0, 0.0), (130.0, 0.3), (200.0, 1.0), (210.0, 1.1)]
 )
-def test_the_matched_radius_is_interpolated_in_its_square(
+def test_the_matched_radius_is_on_a_line_in_its_square(
     edges: float, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = {
@@ -478,8 +478,14 @@ def test_the_matched_radius_is_interpolated_in_its_square(
     monkeypatch.setattr("adaptgns.reproduce.runs.valid_edges", valid_edges)
     sand = study_of(ReproduceConfig(preset="laptop")).sets["sand"]
     radius = matched_radius(sand, "decoupled-weight", 0, 0.02)
-    widest = (0.019 / 0.015) ** 2
-    assert (radius / 0.02) ** 2 == pytest.approx(1 + share * (widest - 1), rel=1e-4)
+    assert (radius / 0.02) ** 2 == pytest.approx(1 + share * ((0.019 / 0.015) ** 2 - 1), rel=1e-4)
+    for far in (5.0, 400.0):
+        found["decoupled-weight", "adaptive"] = far
+        with pytest.raises(StudyError, match=f"sand: no radius matches the {far:.0f} edges of"):
+            matched_radius(sand, "decoupled-weight", 0, 0.02)
+    found["mse-denser", "fixed"] = 90.0
+    with pytest.raises(StudyError, match="fixed graphs have 100 at "):
+        matched_radius(sand, "decoupled-weight", 0, 0.02)
     smoke = study_of(ReproduceConfig(preset="smoke")).sets["sand"]
     with pytest.raises(StudyError, match="no model with the denser graph"):
         matched_radius(smoke, "nll", 0, 0.02)
@@ -557,6 +563,24 @@ def test_differences_are_paired(made: ReproduceConfig) -> None:
     assert found.mean == pytest.approx(
         one.estimate("mse@10").mean - other.estimate("mse@10").mean, rel=1e-6, abs=1e-12
     )
+
+
+def test_only_seeds_of_both_are_compared(made: ReproduceConfig) -> None:
+    results = Results(study_of(made))
+    pair = results.pair("sand", ("nll-400", "fixed"), ("nll", "fixed"))
+    assert pair is not None
+    assert [[run.name for run in each.runs] for each in pair] == [
+        ["sand/nll-400-0"],
+        ["sand/nll-0"],
+    ]
+    assert results.difference(*pair, "mse@10").mean == pytest.approx(
+        pair[0].scalar("mse@10").mean()
+        - results.series["sand", "nll", "fixed"].scalar("mse@10")[0].mean()
+    )
+    pair = results.pair("sand", ("nll", "adaptive"), ("nll", "fixed"))
+    assert pair is not None
+    assert [len(each.runs) for each in pair] == [2, 2]
+    assert results.pair("sand", ("beta-nll", "fixed"), ("nll", "fixed")) is None
 
 
 def test_every_machine_that_a_study_was_made_on_is_named(study: ReproduceConfig) -> None:

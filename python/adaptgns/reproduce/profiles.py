@@ -44,9 +44,10 @@ class Model:
     edges: bool = True
     radius: float | Literal["matched"] = 1.0
     """Times the radius of the data; matched: that whose graph has as many edges as the adaptive one
-    of the model ``matches`` in rollouts of the validation split, interpolated in the radius
-    squared."""
+    of the model ``matches`` in rollouts of the validation split, by a line in the radius's
+    square."""
     matches: str = "nll"
+    """Name of the model that a matched radius is matched to"""
     graph: Literal["base", "adaptive", "two-sided"] = "base"
     variance_weight: float = 0.0
     variance_ahead: bool = False

@@ -9,7 +9,7 @@ covers the truth in 79 to 93 % of cases where seeds differ (simulated); these co
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -168,6 +168,17 @@ class Results:
         """One of them; None where the profile has none."""
         return self.series.get((data, model, policy))
 
+    def pair(
+        self, data: str, one: tuple[str, PolicyName], other: tuple[str, PolicyName]
+    ) -> tuple[Series, Series] | None:
+        """Two models, each under a policy, with the seeds that both have; None where the profile
+        lacks one."""
+        first, second = self.find(data, *one), self.find(data, *other)
+        if first is None or second is None:
+            return None
+        seeds = min(len(first.runs), len(second.runs))  # of each the profile's first ones
+        return replace(first, runs=first.runs[:seeds]), replace(second, runs=second.runs[:seeds])
+
     def difference(self, one: Series, other: Series, scalar: str) -> Estimate:
-        """``one`` less ``other``, paired."""
+        """``one`` less ``other``, paired; of the same seeds."""
         return estimate(one.scalar(scalar) - other.scalar(scalar))

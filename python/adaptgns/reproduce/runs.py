@@ -86,6 +86,8 @@ EVERY = 10
 """Steps between those of the statistics' evolution"""
 TIMED = 40
 """Steps that are timed"""
+FARTHEST = 1.5
+"""Times or part of the data's radius up to which one is matched to a number of edges"""
 DRAWN = (NLL.name, "adaptive")
 """Model and policy whose frames the figures show, of the first seed"""
 LOCAL = {
@@ -684,8 +686,8 @@ def timed_name(model: Model, policy: PolicyName) -> str:
 
 def matched_radius(data: DataSet, name: str, seed: int, radius: float) -> float:
     """The radius of the fixed graph that has as many edges as the adaptive one of the model
-    ``name`` in rollouts of the validation split, interpolated in the radius squared between two
-    models' rollouts."""
+    ``name`` in rollouts of the validation split, by a line in the radius squared through two
+    models' rollouts. StudyError where that is far from both."""
     profile = data.study.profile
     denser = next((m for m in profile.models if m.radius == DENSER), None)
     if denser is None:
@@ -693,9 +695,14 @@ def matched_radius(data: DataSet, name: str, seed: int, radius: float) -> float:
     sparse = valid_edges(data, MSE, seed, "fixed")
     dense = valid_edges(data, denser, seed, "fixed")
     adaptive = valid_edges(data, profile.model(name), seed, "adaptive")
-    share = (adaptive - sparse) / (dense - sparse) if dense != sparse else 0.0
-    squared = radius**2 * (1 + min(max(share, 0.0), 1.0) * (DENSER**2 - 1))
-    return six_digits(math.sqrt(squared))
+    share = (adaptive - sparse) / (dense - sparse) if dense > sparse else math.inf
+    squared = 1 + share * (DENSER**2 - 1)
+    if not FARTHEST**-2 <= squared <= FARTHEST**2:
+        raise StudyError(
+            f"{data.name}: no radius matches the {adaptive:,.0f} edges of {name}, adaptive: fixed "
+            f"graphs have {sparse:,.0f} at {radius:g} and {dense:,.0f} at {DENSER * radius:g}"
+        )
+    return six_digits(radius * math.sqrt(squared))
 
 
 def valid_edges(

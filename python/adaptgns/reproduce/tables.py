@@ -324,9 +324,10 @@ def _comparisons(results: Results, data: DataSet) -> Table:
     marks = results.study.profile.marks
     rows = []
     for question, first, second in COMPARISONS:
-        one, other = (results.find(data.name, *which) for which in (first, second))
-        if one is None or other is None:
+        pair = results.pair(data.name, first, second)
+        if pair is None:
             continue
+        one, other = pair
         rows.append(
             Row(
                 [
@@ -361,8 +362,9 @@ def _comparisons(results: Results, data: DataSet) -> Table:
             f"MSE@{marks[-1]}, seed by seed",
         ),
         rows,
-        "In percent of the other's mean. Differences are paired by seed and trajectory; in "
-        "brackets their 95 % interval, not corrected for the number of comparisons.",
+        "In percent of the other's mean. Differences are paired by trajectory and by seed, of the "
+        "seeds that both have; in brackets their 95 % interval, not corrected for the number of "
+        "comparisons.",
     )
 
 
