@@ -109,7 +109,7 @@ def measure(
         "memory_before_mib": before,
         "memory_peak_mib": resident("VmHWM"),
         "gpu_peak_mib": gpu,
-        "one_latent_per_edge_mib": 4 * edges * MODEL.latent / 2**20,
+        "one_latent_per_edge_mib": (2 if precision == "bf16" else 4) * edges * MODEL.latent / 2**20,
         "plain_computed_mib": plain_mib(particles, edges),
     }
 

@@ -165,8 +165,8 @@ def network_forward(
             None for a network without edges.
         heads: how many of the last perceptrons are read from the last step's nodes.
         keep: whether a backward pass follows.
-        bf16: whether the factors of products, but for those of the heads, are rounded to bf16;
-            their sums and all else are float32.
+        bf16: whether the factors of products, but for those of the heads, are rounded to bf16, and
+            without ``keep`` the edges' latents; sums and all else are float32.
         threads: how many threads may work on the call, all cores if absent.
 
     Returns:

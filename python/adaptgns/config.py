@@ -137,7 +137,7 @@ class RolloutConfig:
     """Radius of the graph alone (length units of the data); features stay divided by the radius
     of training. None: that one."""
     steps: int | None = None
-    """Frames to predict; None: to each trajectory's end."""
+    """Frames to predict, at most; None: to each trajectory's end."""
     trajectories: int | None = None
     """Trajectories to roll out, from the first; None: all."""
     one_step_every: int = 10
@@ -243,8 +243,8 @@ class TrainConfig:
     test_horizon: int | None = 200
     """Frames of those rollouts; None: to the end."""
     precision: Precision = "float32"
-    """bf16: the factors of products up to the heads in 16 bits, all else in 32; for processors with
-    instructions for it, and GPUs."""
+    """bf16: the factors of products up to the heads in 16 bits, in validation the edges' latents,
+    too, all else in 32; for processors with instructions for it, and GPUs."""
 
     def __post_init__(self) -> None:
         _require(

@@ -57,7 +57,8 @@ def network(
     """Outputs ``[N, :]`` of the last ``heads`` of the ``perceptrons``: node encoder, edge encoder,
     each step's edge and node perceptron, heads; without ``graph`` no edge perceptrons. With
     ``alone`` the heads behind the first send no gradients to the rest of the network; with ``bf16``
-    the factors of products are rounded so, but for those of the heads."""
+    the factors of products are rounded so, but for those of the heads, and where no gradients are
+    taken the edges' latents."""
     parameters = [list(perceptron.parameters()) for perceptron in perceptrons]
     sizes = [len(own) for own in parameters]
     flat = [parameter for own in parameters for parameter in own]

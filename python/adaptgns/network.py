@@ -85,9 +85,9 @@ class EncodeProcessDecode(nn.Module):
     learns changes nothing else.
 
     ``precision`` may be changed at any time. With bf16 the products of the encoders and of message
-    passing are of numbers in that type, and in torch's form (on GPUs) the latents of the edges are,
-    too; the parameters, the sums over the steps at the nodes, the heads and the outputs stay in
-    float32.
+    passing are of numbers in that type, and the latents of the edges are, too, in torch's form (on
+    GPUs), and where no gradients are taken; the parameters, the sums over the steps at the nodes,
+    the heads and the outputs stay in float32.
     """
 
     def __init__(

@@ -73,7 +73,7 @@ class Case:
         ]
 
 
-@pytest.mark.parametrize(
+CASES = pytest.mark.parametrize(
     "case",
     [
         {},
@@ -88,6 +88,9 @@ class Case:
     ],
     ids=str,
 )
+
+
+@CASES
 def test_equals_torch_in_double_precision(case: dict[str, int]) -> None:
     made = Case(**case)
     ours, theirs = made.run(), made.run(torch.float64)
@@ -122,17 +125,27 @@ def test_any_number_of_threads_gives_the_same_bits(monkeypatch: pytest.MonkeyPat
         assert torch.equal(one, three)
 
 
-def test_inference_equals_training_and_needs_no_edges_by_sender() -> None:
-    made = Case()
+@pytest.mark.parametrize("precision", ["float32", "bf16"])
+@CASES
+def test_inference_equals_training_and_needs_no_edges_by_sender(
+    case: dict[str, int], precision: Precision
+) -> None:
+    """In bf16 it rounds the edges' latents, too."""
+    made = Case(**case)
+    made.network.precision = precision
     trained = made.run()
-    assert made.graph is not None
-    senders, receivers, offsets = list(vars(made.graph).values())[:3]
+    graph = made.graph
+    if graph is not None:
+        graph = Graph(graph.senders, graph.receivers, graph.receiver_offsets)
     with torch.inference_mode():
-        seen = made.network(
-            made.node_features, made.edge_features, Graph(senders, receivers, offsets)
-        )
-    assert torch.equal(seen.acceleration, trained[0])
-    assert torch.equal(seen.variance, trained[1])
+        seen = made.network(made.node_features, made.edge_features, graph)
+    for output, same in zip((seen.acceleration, seen.variance), trained, strict=False):
+        if output is None:
+            continue
+        if precision == "float32" or graph is None:
+            assert torch.equal(output, same)
+        else:
+            assert float((output - same).norm() / same.norm()) < 0.01
 
 
 def test_a_tape_is_kept_for_gradients_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ const SIDE: usize = 16;
 /// How far a tile reaches along the inner size.
 const DEPTH: usize = 32;
 /// Rows of the left factor that are packed at once, and how much of the inner size.
-const ROWS: usize = 96;
+const ROWS: usize = super::BLOCK;
 const INNER: usize = 512;
 
 type Line = __m512i;

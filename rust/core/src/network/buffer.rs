@@ -1,4 +1,4 @@
-//! Memory that goes from one step to the next, since fresh memory costs a page fault every 4 KiB.
+//! Memory that goes from one step to the next, since fresh memory costs page faults.
 //!
 //! It comes from the system's allocator: what is the global one, which a Python module chooses for
 //! many small requests, may take half as much again for those of megabytes.
@@ -98,8 +98,8 @@ impl Buffer {
         buffer
     }
 
-    /// Its memory as numbers of half the size, of which it has room for `length`.
-    pub fn halves(&mut self, length: usize) -> &mut [u16] {
+    /// Its memory as `length` numbers of half the size.
+    pub fn packed(&mut self, length: usize) -> &mut [u16] {
         assert!(length <= 2 * self.length);
         // SAFETY: so many lie there, of weaker alignment; any bits are a number.
         unsafe { slice::from_raw_parts_mut(self.memory.start.as_ptr().cast(), length) }

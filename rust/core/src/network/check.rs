@@ -28,6 +28,10 @@ impl Network<'_> {
         for layer in &self.layers {
             if let Some(edge) = &layer.edge {
                 check_mlp(edge, Some(3 * width))?;
+                let first = edge.linears[0].outputs();
+                require(first == width, "perceptrons", || {
+                    format!("got {first} outputs of an edge's first map, must be {width}")
+                })?;
             }
             let summands = if with_edges { 2 } else { 1 };
             check_mlp(&layer.node, Some(summands * width))?;

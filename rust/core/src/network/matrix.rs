@@ -172,7 +172,7 @@ struct Task<'a> {
     end: End<'a>,
 }
 
-/// Tile by tile of `R` rows, at most 8, and `C` vectors, at most 4.
+/// Tile by tile of `R` rows, at most 8, and `C` vectors.
 #[inline(always)]
 fn tiles<V: Vector, const R: usize, const C: usize>(
     out: &mut [f32],
@@ -234,6 +234,7 @@ fn tiles<V: Vector, const R: usize, const C: usize>(
 /// The processor has such vectors, and the numbers of the task are there.
 #[inline(always)]
 unsafe fn strip<V: Vector, const R: usize, const C: usize>(task: Task<'_>, column: usize) {
+    const { assert!(R <= 8, "less than eight rows are left") };
     let mut row = 0;
     // SAFETY: handed on.
     unsafe {

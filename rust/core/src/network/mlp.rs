@@ -139,7 +139,8 @@ impl Factor<'_> {
         }
     }
 
-    /// Makes the copy that products take, which the first of them would make else, while others wait.
+    /// Makes the copy that products with the whole weight take, which the first of them would make
+    /// else, while others wait.
     pub fn copy(&self) {
         match self.precision {
             Precision::Float32 => _ = self.numbers(),

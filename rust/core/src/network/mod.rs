@@ -32,14 +32,16 @@ use buffer::Buffer;
 use matrix::{End, Matrix, Start};
 use mlp::{Factor, Input, Kept, KeptMut, split};
 
-/// Rows that go through a perceptron at once.
+/// Rows that go through a perceptron at once: whole tiles, of six rows in float32 and of 32 in
+/// bf16.
 const BLOCK: usize = 96;
 /// The fewest nodes and edges worth a part of their own.
 const NODES: usize = 64;
 const EDGES: usize = 256;
-/// The most parts; each has its own sum of the gradients of the parameters.
+/// The most parts that work is shared out to; each has its own sum of the gradients of the
+/// parameters.
 const PARTS: usize = 64;
-/// Many parts are a multiple of these, so that few threads have as many each.
+/// As many parts or more are a multiple of these, so that few threads have as many each.
 const EVEN: usize = 4;
 
 /// One message-passing step, or with no `edge` one residual perceptron per node.
@@ -179,15 +181,15 @@ impl Network<'_> {
 
         let mut edges = Buffer::default();
         // Whether they lie there in bf16, where nothing goes backward; how many numbers they have.
-        let (mut halves, mut numbers) = (false, 0);
+        let (mut packed, mut numbers) = (false, 0);
         let mut edge_encoder = None;
         let mut parts = Vec::new();
         if let (Some((values, graph)), Some(encoder)) = (features.edges, &self.edge_encoder) {
             let edge_count = graph.senders.len();
             parts = graph.parts();
             numbers = edge_count * width;
-            halves = !keep && encoder.precision() == Precision::Bf16;
-            edges = Buffer::any(if halves { numbers.div_ceil(2) } else { numbers });
+            packed = !keep && encoder.precision() == Precision::Bf16;
+            edges = Buffer::any(if packed { numbers.div_ceil(2) } else { numbers });
             edge_encoder = rows(encoder, edge_count);
             let lengths: Vec<usize> = parts.iter().map(|part| part.edges.len()).collect();
             let pass = Pass {
@@ -196,8 +198,8 @@ impl Network<'_> {
                 team,
             };
             let inputs = [whole_input(encoder, values)];
-            if halves {
-                pass.forward(encoder, &inputs, &mut None, edges.halves(numbers));
+            if packed {
+                pass.forward(encoder, &inputs, &mut None, edges.packed(numbers));
             } else {
                 pass.forward(encoder, &inputs, &mut edge_encoder, &mut edges);
             }
@@ -219,8 +221,8 @@ impl Network<'_> {
                     parts: &parts,
                     team,
                 };
-                if halves {
-                    let edges = edges.halves(numbers);
+                if packed {
+                    let edges = edges.packed(numbers);
                     edge_pass.forward(&projected, &mut None, edges, &mut incoming);
                 } else {
                     edge_pass.forward(&projected, &mut edge, &mut edges, &mut incoming);
@@ -417,16 +419,13 @@ impl Network<'_> {
 impl Edges<'_> {
     /// Parts of whole receivers with about as many edges each.
     fn parts(&self) -> Vec<Part> {
-        let most = self
-            .senders
-            .len()
-            .div_ceil(share(self.senders.len(), EDGES))
-            .max(1);
+        let count = self.senders.len();
+        let size = count.div_ceil(part_count(count, EDGES)).max(1);
         let mut parts = Vec::new();
         let (mut node, mut edge) = (0, 0);
         for (next, &end) in self.offsets.iter().enumerate().skip(1) {
             let end = end as usize;
-            if end >= (parts.len() + 1) * most || next == self.offsets.len() - 1 {
+            if end / size > edge / size || next == self.offsets.len() - 1 {
                 parts.push(Part {
                     nodes: node..next,
                     edges: edge..end,
@@ -438,8 +437,8 @@ impl Edges<'_> {
     }
 }
 
-/// Among how many parts `count` rows are shared out that are worth one by `least`.
-fn share(count: usize, least: usize) -> usize {
+/// Among how many parts `count` rows are shared out, of which `least` are worth one.
+fn part_count(count: usize, least: usize) -> usize {
     let parts = (count / least).clamp(1, PARTS);
     if parts < EVEN {
         parts
@@ -450,7 +449,7 @@ fn share(count: usize, least: usize) -> usize {
 
 /// How many nodes each part has.
 fn lengths(count: usize) -> Vec<usize> {
-    let size = count.div_ceil(share(count, NODES)).max(1);
+    let size = count.div_ceil(part_count(count, NODES)).max(1);
     (0..count)
         .step_by(size)
         .map(|start| size.min(count - start))
@@ -546,7 +545,7 @@ impl Pass<'_> {
             .zip(split(out, self.lengths, self.rows))
             .collect();
         self.team.map(items, |((start, mut place), out)| {
-            let mut room = Buffer::any(BLOCK * width);
+            let mut room = S::room(BLOCK * width);
             for ((first, count), out) in
                 blocks(out.len() / width).zip(out.chunks_mut(BLOCK * width))
             {
@@ -558,7 +557,7 @@ impl Pass<'_> {
                     &inputs,
                     |_, bias| Start::Row(bias),
                     &mut place.block(first, count),
-                    S::take(out, &mut room),
+                    S::begin(out, &mut room),
                 );
                 S::put(out, &room);
             }
@@ -748,7 +747,8 @@ impl Pass<'_> {
 }
 
 /// Copies the weights of `layer` for the products of a `way`, on all threads: one that waits for
-/// another's copy sleeps for longer than that takes.
+/// another's copy sleeps for longer than that takes. (In bf16 parts of weights whose widths are no
+/// multiple of a tile's are copied later.)
 fn copy_weights<'n>(team: &Team, layer: &Layer<'n>, way: for<'l> fn(&'l Linear<'n>) -> Factor<'l>) {
     let mlps = layer.edge.iter().chain([&layer.node]);
     let linears = mlps.flat_map(|mlp| &mlp.linears).collect();
@@ -788,12 +788,11 @@ impl EdgePass<'_> {
             .zip(split(incoming, &nodes, graph.offsets.len() - 1))
             .collect();
         team.map(items, |(((part, mut place), edges), incoming)| {
-            let mut room = Buffer::any(2 * BLOCK * width);
-            let (messages, room) = room.split_at_mut(BLOCK * width);
+            let (mut messages, mut room) = (Buffer::any(BLOCK * width), S::room(BLOCK * width));
             for ((first, count), stored) in
                 blocks(part.edges.len()).zip(edges.chunks_mut(BLOCK * width))
             {
-                let edges = S::take(stored, room);
+                let edges = S::take(stored, &mut room);
                 let here = part.edges.start + first..part.edges.start + first + count;
                 let (senders, receivers) = (&graph.senders[here.clone()], &graph.receivers[here]);
                 let messages = &mut messages[..count * width];
@@ -812,7 +811,7 @@ impl EdgePass<'_> {
                     messages,
                 );
                 rows::add(edges, messages);
-                S::put(stored, room);
+                S::put(stored, &room);
                 rows::add_at(incoming, width, messages, receivers, part.nodes.start);
             }
         });
@@ -908,6 +907,52 @@ mod tests {
     use super::bf16::Right;
     use super::rows::{MOST, Processor};
     use super::*;
+
+    #[test]
+    fn parts_are_of_whole_receivers_with_edges() {
+        let hub = |at: usize| {
+            (0..2_000).map(move |i| {
+                if i == at {
+                    60_000
+                } else {
+                    i64::from(i % 9 == 0)
+                }
+            })
+        };
+        let cases: [Vec<i64>; 6] = [
+            vec![],
+            vec![0; 300],
+            vec![6; 5_000],
+            hub(0).collect(),
+            hub(1_000).collect(),
+            (0..300).map(|i| if i < 256 { 4 } else { 0 }).collect(),
+        ];
+        for degrees in cases {
+            let ends = degrees.iter().scan(0, |end, degree| {
+                *end += degree;
+                Some(*end)
+            });
+            let offsets: Vec<i64> = [0].into_iter().chain(ends).collect();
+            let senders = vec![0; offsets[degrees.len()] as usize];
+            let edges = Edges {
+                senders: &senders,
+                receivers: &senders,
+                offsets: &offsets,
+                by_sender: &[],
+                sender_offsets: &[],
+            };
+            let parts = edges.parts();
+            assert!(parts.len() <= PARTS + 1);
+            let (mut node, mut edge) = (0, 0);
+            for (i, part) in parts.iter().enumerate() {
+                assert_eq!((part.nodes.start, part.edges.start), (node, edge));
+                assert_eq!(part.edges.end, offsets[part.nodes.end] as usize);
+                assert!(!part.edges.is_empty() || i + 1 == parts.len());
+                (node, edge) = (part.nodes.end, part.edges.end);
+            }
+            assert_eq!((node, edge), (degrees.len(), senders.len()));
+        }
+    }
 
     /// Numbers from -1 to 1 that follow from the seed.
     fn numbers(seed: u64, count: usize) -> Vec<f32> {
@@ -1050,7 +1095,26 @@ mod tests {
 
     proptest! {
         #[test]
-        fn products_are_sums_of_products(case in cases(21, 9, 75), kind in 0usize..3) {
+        fn copies_lie_as_they_should(
+            rows in 1usize..40, columns in 1usize..40, gap in 0usize..3, transposed: bool,
+        ) {
+            let data = numbers(1, rows * columns);
+            let matrix = Matrix::new(&data, columns);
+            let matrix = if transposed { matrix.transposed() } else { matrix };
+            let (rows, columns) = matrix.size();
+            let stride = columns + gap;
+            let mut out = vec![2.0; rows * stride - gap];
+            matrix.copy_to(&mut out, stride);
+            for (i, row) in out.chunks(stride).enumerate() {
+                for (j, &x) in row.iter().enumerate() {
+                    let place = if transposed { j * rows + i } else { i * columns + j };
+                    prop_assert_eq!(x, if j < columns { data[place] } else { 2.0 });
+                }
+            }
+        }
+
+        #[test]
+        fn products_are_sums_of_products(case in cases(21, 9, 130), kind in 0usize..3) {
             be(PROCESSORS[kind]);
             case.check(matrix::product, |_| {}, 1e-5)?;
             be_whole();
@@ -1058,7 +1122,7 @@ mod tests {
 
         #[test]
         fn products_in_bf16_are_those_of_rounded_numbers(
-            case in cases(140, 90, 75), kind in 0usize..4,
+            case in cases(140, 90, 130), kind in 0usize..4,
         ) {
             be(PROCESSORS[kind]);
             case.check(
@@ -1334,12 +1398,12 @@ mod tests {
     }
 
     #[test]
-    fn halves_of_a_buffer_are_its_memory() {
+    fn packed_numbers_are_rounded_ones() {
         let mut values = numbers(3, 2 * 33);
         let mut buffer = Buffer::any(33);
-        u16::put(buffer.halves(66), &values);
+        u16::put(buffer.packed(66), &values);
         let mut room = vec![0.0; 70];
-        let taken = u16::take(&mut buffer.halves(66)[..65], &mut room);
+        let taken = u16::take(&mut buffer.packed(66)[..65], &mut room);
         bf16::round(&mut values);
         assert!(taken == &values[..65]);
     }
