@@ -270,6 +270,11 @@ EDGES = (np.zeros((1, 2), np.float32), INDEX)
         ({"perceptrons": [*GOOD[:3], [], *GOOD[4:]]}, ValueError, "a perceptron with no map"),
         ({"perceptrons": [*GOOD[:4], linear(2, 5)]}, ValueError, "a map of 5 inputs"),
         ({"perceptrons": [*GOOD[:4], linear(2, 4)[:1]]}, TypeError, "pairs of arrays"),
+        (
+            {"perceptrons": [*GOOD[:2], [*linear(3, 12), *linear(4, 3), *norm(4)], *GOOD[3:]]},
+            ValueError,
+            r"got maps of \[3, 4\] outputs for edges, must be 4",
+        ),
         ({"threads": 0}, ValueError, "threads: got 0"),
     ],
 )

@@ -1,6 +1,6 @@
 //! Whether what a caller hands in fits together, so that nothing behind it can fail.
 
-use super::mlp::Mlp;
+use super::mlp::{Linear, Mlp};
 use super::{Edges, Features, Network, Tape};
 use crate::Error;
 
@@ -28,10 +28,12 @@ impl Network<'_> {
         for layer in &self.layers {
             if let Some(edge) = &layer.edge {
                 check_mlp(edge, Some(3 * width))?;
-                let first = edge.linears[0].outputs();
-                require(first == width, "perceptrons", || {
-                    format!("got {first} outputs of an edge's first map, must be {width}")
-                })?;
+                let outputs: Vec<usize> = edge.linears.iter().map(Linear::outputs).collect();
+                require(
+                    outputs.iter().all(|&own| own == width),
+                    "perceptrons",
+                    || format!("got maps of {outputs:?} outputs for edges, must be {width}"),
+                )?;
             }
             let summands = if with_edges { 2 } else { 1 };
             check_mlp(&layer.node, Some(summands * width))?;
