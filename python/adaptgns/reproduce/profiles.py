@@ -215,7 +215,7 @@ PAPER_MODELS = (
 
 
 def one_seed(model: Model) -> Model:
-    """``model`` with the first seed alone, under the policies that cost least to compare."""
+    """``model`` with the first seed alone, its graphs fixed and, if it has sigma, adaptive."""
     policies = tuple(policy for policy in model.policies if policy in ("fixed", "adaptive"))
     return replace(model, title=f"{model.title}, one seed", seeds=1, policies=policies)
 

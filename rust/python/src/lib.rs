@@ -17,7 +17,8 @@ use pyo3::prelude::*;
 #[global_allocator]
 static ALLOCATOR: MiMalloc = MiMalloc;
 
-/// Graph builders, the data generator and the graph network of AdaptGNS.
+/// Graph builders, the data generator and the graph network of AdaptGNS. Other Python threads go on
+/// during a call; none of them may write to the arrays that it was given.
 #[pymodule]
 fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     graph::register(module)?;
