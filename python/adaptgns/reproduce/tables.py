@@ -102,6 +102,7 @@ COMPARISONS: tuple[Comparison, ...] = (
     ("r 0.019 or 0.015, MSE", ("mse-denser", "fixed"), ("mse", "fixed")),
     ("adaptive NLL or MSE at matched edges", ("nll", "adaptive"), ("mse-matched", "fixed")),
     ("adaptive or r 0.0176, NLL", ("nll", "adaptive"), ("nll-middle", "fixed")),
+    ("r 0.0176 or 0.015, NLL", ("nll-middle", "fixed"), ("nll", "fixed")),
     (
         "trained on adaptive or base graphs, adaptive",
         ("nll-adaptive", "adaptive"),
@@ -160,9 +161,19 @@ COMPARISONS: tuple[Comparison, ...] = (
         ("decoupled-weight", "fixed"),
     ),
     (
+        "adaptive decoupled, latents shaped, or fixed MSE: the aim",
+        ("decoupled-weight", "adaptive"),
+        ("mse", "fixed"),
+    ),
+    (
         "adaptive or fixed, decoupled, deeper head",
         ("decoupled-deep", "adaptive"),
         ("decoupled-deep", "fixed"),
+    ),
+    (
+        "adaptive or fixed, sigma of the next step",
+        ("decoupled-ahead", "adaptive"),
+        ("decoupled-ahead", "fixed"),
     ),
     (
         "sigma of the next step or of this one",
