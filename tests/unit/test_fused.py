@@ -9,6 +9,7 @@ from torch import Tensor
 
 from adaptgns import fused
 from adaptgns._core import network_backward, network_forward
+from adaptgns.config import Precision
 from adaptgns.network import EncodeProcessDecode
 from adaptgns.segment import Graph
 

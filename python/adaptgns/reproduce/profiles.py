@@ -227,7 +227,6 @@ ONE_SEED = tuple(
             *DECOUPLED_VARIANTS,
             DENSER_MSE,
             MIDDLE_NLL,
-            BETA_NLL,
             replace(
                 MATCHED_MSE,
                 name="mse-matched-decoupled",
