@@ -36,6 +36,11 @@ COLOURS = {
     "mse-denser": SERIES[4],
     "tuned": "#b0528f",
     "decoupled": "#4f8f3a",
+    "decoupled-weight": "#9bc53d",
+    "decoupled-deep": "#1f4d2b",
+    "decoupled-ahead": "#3fae8c",
+    "nll-middle": "#e58f73",
+    "mse-matched-decoupled": "#5b78b0",
 }
 FIGURE_3 = (("mse", "fixed"), ("nll", "fixed"), ("nll", "adaptive"), ("nll", "random"))
 EXTRA_EDGE, BASE_EDGE = "#1fa774", "#c3cad3"
@@ -222,6 +227,8 @@ def _band(ax: Axes, curves: NDArray[np.float64], series: Series) -> None:
 def _pareto(results: Results, sets: list[DataSet]) -> Figure:
     mark = results.study.last_mark
     figure, rows = _panels(2, 2.6 * len(sets), len(sets))
+    models: dict[str, dict[str, Any]] = {}
+    policies: dict[str, dict[str, Any]] = {}
     for panels, data in zip(rows, sets, strict=True):
         for ax, unit in zip(panels, ("directed edges a step", "milliseconds a step"), strict=True):
             for series in results.of(data.name):
@@ -234,20 +241,24 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                     if time["elsewhere"]:
                         continue
                     cost = time["graph_ms"] + time["model_ms"]
+                # Hollow, that models trained for longer stand out beside those of their colour.
+                face = "none" if series.model.share > 1 else colour(series)
                 ax.errorbar(
                     cost,
                     error.mean,
                     yerr=[[error.mean - error.low], [error.high - error.mean]],
                     color=colour(series),
                     marker=MARKERS[series.policy],
-                    # Hollow, that models trained for longer stand out beside those of their colour.
-                    markerfacecolor="none" if series.model.share > 1 else None,
+                    markerfacecolor=face,
                     linestyle="none",
                     capsize=2,
-                    label=series_label(series),
                 )
+                models[series.model.title] = {"color": colour(series), "markerfacecolor": face}
+                policies[series.policy] = {"color": BASELINE, "marker": MARKERS[series.policy]}
             ax.set(title=f"{data.name}: MSE@{mark}, length²", xlabel=unit, yscale="log")
             ax.margins(0.15)
+    for label, style in (models | policies).items():
+        rows[0][0].plot([], [], linestyle="none", label=label, **{"marker": "o", **style})
     figures.legend(figure, rows[0][0])
     return figure
 

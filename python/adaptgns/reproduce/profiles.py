@@ -230,7 +230,7 @@ ONE_SEED = tuple(
             replace(
                 MATCHED_MSE,
                 name="mse-matched-decoupled",
-                title="GNS, MSE, r of as many edges as adaptive decoupled, latents shaped",
+                title="GNS, MSE, r matched to decoupled's edges",
                 matches="decoupled-weight",
             ),
         ),
