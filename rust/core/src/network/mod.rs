@@ -180,15 +180,16 @@ impl Network<'_> {
         );
 
         let mut edges = Buffer::default();
-        // Whether they lie there in bf16, where nothing goes backward; how many numbers they have.
-        let (mut packed, mut numbers) = (false, 0);
+        let encoder = self.edge_encoder.as_ref();
+        let rounded = encoder.is_some_and(|mlp| mlp.precision() == Precision::Bf16);
+        // Whether they lie there in bf16.
+        let packed = rounded && !keep;
         let mut edge_encoder = None;
         let mut parts = Vec::new();
-        if let (Some((values, graph)), Some(encoder)) = (features.edges, &self.edge_encoder) {
+        if let (Some((values, graph)), Some(encoder)) = (features.edges, encoder) {
             let edge_count = graph.senders.len();
             parts = graph.parts();
-            numbers = edge_count * width;
-            packed = !keep && encoder.precision() == Precision::Bf16;
+            let numbers = edge_count * width;
             edges = Buffer::any(if packed { numbers.div_ceil(2) } else { numbers });
             edge_encoder = rows(encoder, edge_count);
             let lengths: Vec<usize> = parts.iter().map(|part| part.edges.len()).collect();
@@ -222,7 +223,7 @@ impl Network<'_> {
                     team,
                 };
                 if packed {
-                    let edges = edges.packed(numbers);
+                    let edges = edges.packed(graph.senders.len() * width);
                     edge_pass.forward(&projected, &mut None, edges, &mut incoming);
                 } else {
                     edge_pass.forward(&projected, &mut edge, &mut edges, &mut incoming);
@@ -764,6 +765,13 @@ struct EdgePass<'p> {
 }
 
 impl EdgePass<'_> {
+    /// How many edges and how many nodes each part has.
+    fn part_lengths(&self) -> (Vec<usize>, Vec<usize>) {
+        (self.parts.iter())
+            .map(|part| (part.edges.len(), part.nodes.len()))
+            .unzip()
+    }
+
     /// Adds its message to every edge, and the sum of a receiver's messages to `incoming`.
     fn forward<S: Stored>(
         &self,
@@ -772,17 +780,13 @@ impl EdgePass<'_> {
         edges: &mut [S],
         incoming: &mut [f32],
     ) {
-        let Self {
-            mlp,
-            graph,
-            parts,
-            team,
-        } = *self;
+        let &Self {
+            mlp, graph, team, ..
+        } = self;
         let width = mlp.outputs();
-        let (lengths, nodes) = part_lengths(parts);
+        let (lengths, nodes) = self.part_lengths();
         let count = graph.senders.len();
-        let items: Vec<_> = parts
-            .iter()
+        let items: Vec<_> = (self.parts.iter())
             .zip(Place::of(kept, mlp, &lengths, count))
             .zip(split(edges, &lengths, count))
             .zip(split(incoming, &nodes, graph.offsets.len() - 1))
@@ -830,17 +834,13 @@ impl EdgePass<'_> {
         to_receivers: &mut [f32],
         to_first: &mut [f32],
     ) -> Buffer {
-        let Self {
-            mlp,
-            graph,
-            parts,
-            team,
-        } = *self;
+        let &Self {
+            mlp, graph, team, ..
+        } = self;
         let width = mlp.outputs();
-        let (lengths, nodes) = part_lengths(parts);
+        let (lengths, nodes) = self.part_lengths();
         let count = graph.senders.len();
-        let items: Vec<_> = parts
-            .iter()
+        let items: Vec<_> = (self.parts.iter())
             .zip(kept.parts(&lengths, count))
             .zip(split(edges, &lengths, count))
             .zip(split(to_edges, &lengths, count))
@@ -875,14 +875,6 @@ impl EdgePass<'_> {
             sum
         })
     }
-}
-
-/// How many edges and how many nodes each part has.
-fn part_lengths(parts: &[Part]) -> (Vec<usize>, Vec<usize>) {
-    parts
-        .iter()
-        .map(|part| (part.edges.len(), part.nodes.len()))
-        .unzip()
 }
 
 /// The parts' sums, as `of_part` gives them, added up in order; of no parts, 0 for each parameter of
