@@ -113,6 +113,14 @@ class AdaptiveConfig:
             self, tau=PERCENTILE, factor=FACTOR, low_tau=PERCENTILE, low_factor=ABOVE_ZERO_TO_ONE
         )
 
+    def require_two_sides(self) -> None:
+        """Raise ValueError where the two sides of the rule overlap."""
+        if self.low_tau > self.tau:
+            raise ValueError(
+                f"low_tau: got {self.low_tau:g}; accepted for two-sided graphs are numbers up to "
+                f"tau, {self.tau:g}"
+            )
+
 
 @dataclass(frozen=True)
 class RolloutConfig:
@@ -160,6 +168,8 @@ class RolloutConfig:
             one_step_every=COUNT,
             seed=NOT_NEGATIVE,
         )
+        if self.policy == "two-sided":
+            self.adaptive.require_two_sides()
 
 
 @dataclass(frozen=True)
@@ -273,6 +283,8 @@ class TrainConfig:
             test_trajectories=COUNT,
             test_horizon=COUNT,
         )
+        if self.graph == "two-sided":
+            self.adaptive.require_two_sides()
         if self.variance_ahead and (self.loss != "decoupled" or self.unroll < 2):
             raise ValueError(
                 f"variance_ahead: needs the loss decoupled and unroll >= 2; got {self.loss} and "
