@@ -45,6 +45,8 @@ class Checkpoint:
     tensors: dict[str, Tensor]
     validated: bool = True
     """Whether the validation that is due at this step has been done."""
+    types: tuple[int, ...] | None = None
+    """Particle types that it was trained on, ascending; None: not known."""
 
     def group(self, name: str) -> dict[str, Tensor]:
         """The tensors whose names start with ``name.``, without that prefix."""
@@ -85,6 +87,8 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "best_score": repr(checkpoint.best_score),
         "validated": str(checkpoint.validated),
     }
+    if checkpoint.types is not None:
+        header["types"] = json.dumps(checkpoint.types)
     with written_whole(path) as partial:
         partial.write_bytes(save(checkpoint.tensors, header))
 
@@ -117,6 +121,7 @@ def read_checkpoint(path: Path, *, device: str = "cpu") -> Checkpoint:
         best_score=float(header["best_score"]),
         tensors=tensors,
         validated=header.get("validated") != "False",
+        types=tuple(json.loads(header["types"])) if "types" in header else None,
     )
 
 

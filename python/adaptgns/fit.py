@@ -101,6 +101,7 @@ class Trainer:
         self.validated = True
         if checkpoint is not None:
             self._restore(checkpoint)
+        self.types = train.types()
         self.windows = Windows(train, metadata, config, noise=config.noise)
         if not len(self.windows):
             raise ValueError(
@@ -140,7 +141,13 @@ class Trainer:
             for index, state in self.optimizer.state_dict()["state"].items():
                 tensors |= with_prefix(f"optimizer.{index}", state)
         return Checkpoint(
-            self.config, self.metadata, self.step, self.best_score, tensors, self.validated
+            self.config,
+            self.metadata,
+            self.step,
+            self.best_score,
+            tensors,
+            self.validated,
+            self.types,
         )
 
     def save(self) -> None:

@@ -187,9 +187,18 @@ def open_data(
     DataError where there is none, or none that the model can step forward.
     """
     folder = dataset_folder(data or checkpoint.config.data)
-    for note in checkpoint.metadata.check_suits(folder):
+    notes = checkpoint.metadata.check_suits(folder)
+    trajectories = open_split(folder, split)
+    if checkpoint.types is not None:
+        there, known = trajectories.types(), checkpoint.types
+        if not set(there) <= set(known):
+            notes.append(
+                f"{trajectories.path}: has particles of types {', '.join(map(str, there))}; the "
+                f"model was trained on {', '.join(map(str, known))} and knows no others"
+            )
+    for note in notes:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
-    return open_split(folder, split)
+    return trajectories
 
 
 def write_rollouts(config: RolloutConfig, console: Console) -> None:

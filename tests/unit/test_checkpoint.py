@@ -48,12 +48,15 @@ def checkpoint(small_config: TrainConfig, metadata: Metadata) -> Checkpoint:
 def test_round_trip(checkpoint: Checkpoint, tmp_path: Path) -> None:
     write_checkpoint(tmp_path / LAST, checkpoint)
     back = read_checkpoint(tmp_path)
-    assert (back.config, back.metadata, back.step, back.best_score) == (
+    assert (back.config, back.metadata, back.step, back.best_score, back.types) == (
         checkpoint.config,
         checkpoint.metadata,
         7,
         0.5,
+        None,
     )
+    write_checkpoint(tmp_path / LAST, replace(checkpoint, types=(3, 5)))
+    assert read_checkpoint(tmp_path).types == (3, 5)
     ours, theirs = checkpoint.simulator().state_dict(), back.simulator().state_dict()
     assert ours.keys() == theirs.keys()
     assert all(torch.equal(ours[k], theirs[k]) for k in ours)
@@ -147,6 +150,7 @@ def test_pretrained_models_come_with_the_package(name: str) -> None:
     assert checkpoint.config.out is None
     assert (PRETRAINED / f"{name}.safetensors").stat().st_size < 2 << 20
     trajectory = Trajectory("new", *simulate(name, seed=7, frames=300, particles=(200, 300)))
+    assert checkpoint.types == tuple(np.unique(trajectory.particle_type))
     simulator = checkpoint.simulator()
     made = list(steps(simulator, trajectory, Fixed(), 250, teacher_forcing=True))
     true = np.diff(trajectory.positions.astype(np.float64), n=2, axis=0)

@@ -87,6 +87,7 @@ def test_metrics_best_checkpoint_and_log_after_a_resume(
 ) -> None:
     trainer(drops, tmp_path, small_config).run(QUIET)
     best = read_checkpoint(tmp_path / BEST)
+    assert best.types == (5,)
     assert best.step in (6, 12)
     assert not best.group("optimizer")
     scores = {e["step"]: e["valid_rollout_mse"] for e in log(tmp_path) if "valid_rollout_mse" in e}

@@ -296,6 +296,16 @@ def test_what_the_model_takes_otherwise_is_told(
     assert "periodic is (True, False)" in capsys.readouterr().err
 
 
+def test_types_that_the_model_was_not_trained_on_are_told(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for model, told in (("sand", True), ("waterdrop", False)):
+        options = ["--checkpoint", model, "--data", str(drops), "--trajectories", "1"]
+        main([*options, "--steps", "1", "--out", str(tmp_path / f"{model}.h5")])
+        message = "has particles of types 5; the model was trained on 6 and knows no others"
+        assert (message in capsys.readouterr().out) == told
+
+
 def test_a_horizon_behind_the_end_of_the_data_is_told(
     drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
