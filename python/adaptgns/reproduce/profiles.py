@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 from adaptgns.atomic import six_digits
 from adaptgns.config import HISTORY, AdaptiveConfig, Loss, PolicyName, TrainConfig
@@ -56,8 +56,6 @@ class Model:
     """Of the profile's training steps"""
     seeds: int | None = None
     """How many of the profile's seeds, from the first; None: all"""
-    sets: tuple[str, ...] | None = None
-    """Names of the data sets that it is trained on; None: all"""
     timed_as: str | None = None
     """Name of the model whose steps take as long, being of the same network"""
     policies: tuple[PolicyName, ...] = ("fixed",)
@@ -117,37 +115,31 @@ EARLY = tuple(
     )
     for percent in (10, 30)
 )
-
-
-def longer(percent: int, budget: Model) -> tuple[Model, Model, Model]:
-    """MSE, NLL and the chosen rule, trained for so many percent of the steps with the first seed;
-    the rule may have as many edges as the fixed graph of ``budget``, trained as long."""
-
-    def of(model: Model, **settings: Any) -> Model:
-        return replace(
-            model,
-            name=f"{model.name}-{percent}",
-            title=f"{model.title}, {percent} % of the steps, one seed",
-            share=percent / 100,
-            seeds=1,
-            **settings,
-        )
-
-    chosen = Chosen(f"{NLL.name}-{percent}", f"{budget.name}-{percent}", f"sweep-{percent}")
-    return (
-        of(MSE, timed_as=MSE.name, policies=("fixed", "divergence")),
-        of(NLL, timed_as=NLL.name),
-        of(TUNED, chosen=chosen),
-    )
-
-
-def on_water(models: Iterable[Model]) -> tuple[Model, ...]:
-    """``models``, on that set alone."""
-    return tuple(replace(model, sets=("waterdrop",)) for model in models)
-
-
-LONG = LONG_MSE, LONG_NLL, LONG_TUNED = longer(400, budget=NLL)
-LONGEST = on_water(longer(800, budget=MSE))
+LONG_MSE = replace(
+    MSE,
+    name="mse-400",
+    title="GNS, MSE, 400 % of the steps, one seed",
+    share=4.0,
+    seeds=1,
+    timed_as="mse",
+    policies=("fixed", "divergence"),
+)
+LONG_NLL = replace(
+    NLL,
+    name="nll-400",
+    title="GNS, NLL, 400 % of the steps, one seed",
+    share=4.0,
+    seeds=1,
+    timed_as="nll",
+)
+LONG_TUNED = replace(
+    TUNED,
+    name="tuned-400",
+    title="AdaptGNS, chosen rule, 400 % of the steps, one seed",
+    share=4.0,
+    seeds=1,
+    chosen=Chosen(weights="nll-400", budget="nll-400", folder="sweep-400"),
+)
 ADAPTIVE_NLL = replace(
     NLL,
     name="nll-adaptive",
@@ -233,8 +225,8 @@ ONE_SEED = tuple(
         one_seed,
         (
             *DECOUPLED_VARIANTS[1:],
-            DENSER_MSE,
-            MIDDLE_NLL,
+            BETA_NLL,
+            MATCHED_MSE,
             replace(
                 MATCHED_MSE,
                 name="mse-matched-decoupled",
@@ -300,10 +292,6 @@ class Profile:
         """Those that ``model`` is trained with."""
         return self.seeds[: model.seeds]
 
-    def models_on(self, data: str) -> tuple[Model, ...]:
-        """Those that are trained on the data set of that name."""
-        return tuple(each for each in self.models if each.sets is None or data in each.sets)
-
     def model(self, name: str) -> Model:
         """The one of that name."""
         return next(model for model in self.models if model.name == name)
@@ -321,9 +309,11 @@ PROFILES: dict[ProfileName, Profile] = {
             NLL,
             MLP,
             EARLY[1],
+            LONG_NLL,
+            LONG_MSE,
             DECOUPLED,
             TUNED,
-            *on_water(LONG),
+            LONG_TUNED,
         ),
         sweep=Sweep(tau=(70.0,), factor=(1.1, 1.267), radius=(0.9, 1.0)),
         seeds=(0, 1),
@@ -356,13 +346,13 @@ PROFILES: dict[ProfileName, Profile] = {
             *EARLY,
             LONG_NLL,
             LONG_MSE,
-            *LONGEST[:2],
             ADAPTIVE_NLL,
             DECOUPLED_VARIANTS[0],
+            DENSER_MSE,
+            MIDDLE_NLL,
             *ONE_SEED,
             TUNED,
             LONG_TUNED,
-            LONGEST[2],
         ),
         sweep=Sweep(trajectories=5),
         seeds=(0, 1, 2),

@@ -105,7 +105,7 @@ def _markdown(study: Study, made: list[Table], images: list[Path]) -> str:
             parts.append(table.note)
     parts.append("## Figures")
     for data in study.sets.values():
-        for model in study.profile.models_on(data.name):
+        for model in study.profile.models:
             if model.chosen is None:
                 continue
             folder = data.metrics / model.chosen.folder

@@ -40,54 +40,6 @@ vectorized! {
     }
 }
 
-/// Numbers as they lie in memory from step to step: in float32, or in bf16 and half of it.
-pub(super) trait Stored: Copy + Send {
-    /// Room to work on up to `count` of them, where they are not worked on in their place.
-    fn room(count: usize) -> Buffer;
-    /// Where as many as `stored` are worked on, of any values.
-    fn begin<'r>(stored: &'r mut [Self], room: &'r mut [f32]) -> &'r mut [f32];
-    /// The same, of the values of `stored`.
-    fn take<'r>(stored: &'r mut [Self], room: &'r mut [f32]) -> &'r mut [f32];
-    /// Gives `stored` the values that were worked on.
-    fn put(stored: &mut [Self], room: &[f32]);
-}
-
-impl Stored for f32 {
-    fn room(_: usize) -> Buffer {
-        Buffer::default()
-    }
-
-    fn begin<'r>(stored: &'r mut [f32], _: &'r mut [f32]) -> &'r mut [f32] {
-        stored
-    }
-
-    fn take<'r>(stored: &'r mut [f32], _: &'r mut [f32]) -> &'r mut [f32] {
-        stored
-    }
-
-    fn put(_: &mut [f32], _: &[f32]) {}
-}
-
-impl Stored for u16 {
-    fn room(count: usize) -> Buffer {
-        Buffer::any(count)
-    }
-
-    fn begin<'r>(stored: &'r mut [u16], room: &'r mut [f32]) -> &'r mut [f32] {
-        &mut room[..stored.len()]
-    }
-
-    fn take<'r>(stored: &'r mut [u16], room: &'r mut [f32]) -> &'r mut [f32] {
-        let room = &mut room[..stored.len()];
-        unpack(stored, room);
-        room
-    }
-
-    fn put(stored: &mut [u16], room: &[f32]) {
-        pack(&room[..stored.len()], stored);
-    }
-}
-
 /// The right factor of a product.
 #[derive(Clone, Copy)]
 pub(super) enum Right<'a> {

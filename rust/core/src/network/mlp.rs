@@ -1,6 +1,6 @@
 //! Perceptrons over blocks of rows: all layers of a block while it lies in the cache.
 
-use std::ops::{DerefMut, Range};
+use std::ops::Range;
 use std::sync::OnceLock;
 
 #[cfg(target_arch = "x86_64")]
@@ -9,6 +9,7 @@ use super::bf16::{self, Right};
 use super::buffer::Buffer;
 use super::matrix::{End, Matrix, Start, product};
 use super::rows;
+use super::stored::{Block, Stored, StoredMut, split};
 
 /// What the factors of a map's products are rounded to; sums are in float32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -206,17 +207,32 @@ pub(super) struct Input<'a> {
     pub column: usize,
 }
 
-/// What the backward pass needs of a number of rows, in memory of its own or borrowed.
+/// What the backward pass needs of a number of rows.
 #[derive(Default)]
-pub(super) struct Kept<D = Buffer> {
-    /// After each ReLU.
-    hidden: Vec<D>,
+pub(super) struct Kept {
+    /// After each ReLU; in bf16 no more is lost than in the products that they are factors of.
+    hidden: Vec<Stored>,
     /// Before the LayerNorm's scale and shift; empty without one.
-    normalized: D,
-    inverse_std: D,
+    normalized: Buffer,
+    inverse_std: Buffer,
 }
 
-pub(super) type KeptMut<'k> = Kept<&'k mut [f32]>;
+/// The same of a part of the rows, or, where nothing goes backward, room for one block of them after
+/// the other.
+pub(super) struct KeptPart<'k> {
+    hidden: Vec<StoredMut<'k>>,
+    normalized: &'k mut [f32],
+    inverse_std: &'k mut [f32],
+    rows: usize,
+    in_turn: bool,
+}
+
+/// The same of a block of a part's rows.
+pub(super) struct KeptBlock<'k> {
+    hidden: Vec<Block<'k>>,
+    normalized: &'k mut [f32],
+    inverse_std: &'k mut [f32],
+}
 
 impl<'a> Mlp<'a> {
     /// How many numbers come out per row.
@@ -252,12 +268,12 @@ impl<'a> Mlp<'a> {
         linears + self.norm.map_or(0, |norm| 2 * norm.scale.len())
     }
 
-    pub(super) fn kept(&self, rows: usize) -> Kept {
+    /// Room for what a pass over `rows` rows keeps, `packed` or not.
+    pub(super) fn kept(&self, rows: usize, packed: bool) -> Kept {
         let normed = if self.norm.is_some() { rows } else { 0 };
         Kept {
-            hidden: self
-                .hidden_widths()
-                .map(|w| Buffer::any(rows * w))
+            hidden: (self.hidden_widths())
+                .map(|width| Stored::any(rows * width, packed))
                 .collect(),
             normalized: Buffer::any(normed * self.outputs()),
             inverse_std: Buffer::any(normed),
@@ -270,7 +286,7 @@ impl<'a> Mlp<'a> {
         &self,
         inputs: &[Input<'_>],
         begin: impl for<'b> FnOnce(&mut [f32], &'b [f32]) -> Start<'b>,
-        kept: &mut KeptMut<'_>,
+        kept: &mut KeptBlock<'_>,
         out: &mut [f32],
     ) {
         let last = self.linears.len() - 1;
@@ -278,7 +294,7 @@ impl<'a> Mlp<'a> {
         for (i, linear) in self.linears.iter().enumerate() {
             let (before, after) = kept.hidden.split_at_mut(i);
             let target = match after.first_mut() {
-                Some(hidden) => &mut **hidden,
+                Some(hidden) => &mut *hidden.numbers,
                 None if self.norm.is_some() => &mut *kept.normalized,
                 None => &mut *out,
             };
@@ -295,9 +311,12 @@ impl<'a> Mlp<'a> {
                     start = Start::There;
                 }
             } else {
-                let rows = Matrix::new(before[i - 1], linear.inputs());
+                let rows = Matrix::new(before[i - 1].numbers, linear.inputs());
                 let start = Start::Row(linear.bias);
                 (linear.forward()).product(target, outputs, start, rows, end);
+            }
+            if let Some(hidden) = after.first_mut() {
+                hidden.put();
             }
         }
         if let Some(norm) = self.norm {
@@ -307,7 +326,7 @@ impl<'a> Mlp<'a> {
     }
 
     /// What [`Self::forward`] gave for the rows that `kept` is of.
-    pub(super) fn outputs_again(&self, kept: &KeptMut<'_>, out: &mut [f32]) {
+    pub(super) fn outputs_again(&self, kept: &KeptBlock<'_>, out: &mut [f32]) {
         let norm = self.norm.expect("only what a LayerNorm gave is kept");
         rows::rescale(out, kept.normalized, norm.scale, norm.shift);
     }
@@ -318,7 +337,7 @@ impl<'a> Mlp<'a> {
     pub(super) fn backward<'g>(
         &self,
         inputs: &[Input<'_>],
-        kept: &KeptMut<'_>,
+        kept: &mut KeptBlock<'_>,
         rows: usize,
         buffers: [&'g mut [f32]; 2],
         mut parameters: &mut [f32],
@@ -355,7 +374,9 @@ impl<'a> Mlp<'a> {
                 }
                 break;
             }
-            let activation = &*kept.hidden[i - 1];
+            let activation = &mut kept.hidden[i - 1];
+            activation.take();
+            let activation = &*activation.numbers;
             let inner = Matrix::new(activation, columns);
             linear.add_product(to_weight, columns, outer.transposed(), inner);
             let before = &mut spare[..rows * columns];
@@ -384,47 +405,53 @@ impl<'a> Mlp<'a> {
 
 impl Kept {
     /// One part after the other of its `rows` rows.
-    pub fn parts(&mut self, lengths: &[usize], rows: usize) -> Vec<KeptMut<'_>> {
+    pub fn parts(&mut self, lengths: &[usize], rows: usize) -> Vec<KeptPart<'_>> {
         let mut hidden: Vec<_> = (self.hidden.iter_mut())
-            .map(|hidden| split(hidden, lengths, rows).into_iter())
+            .map(|hidden| hidden.all().parts(lengths, rows).into_iter())
             .collect();
         split(&mut self.normalized, lengths, rows)
             .into_iter()
             .zip(split(&mut self.inverse_std, lengths, rows))
-            .map(|(normalized, inverse_std)| Kept {
+            .zip(lengths)
+            .map(|((normalized, inverse_std), &rows)| KeptPart {
                 hidden: hidden.iter_mut().filter_map(Iterator::next).collect(),
                 normalized,
                 inverse_std,
+                rows,
+                in_turn: false,
             })
             .collect()
     }
-}
 
-impl<D: DerefMut<Target = [f32]>> Kept<D> {
-    /// The rows `first` to `first + count` of `rows`.
-    pub fn block(&mut self, first: usize, count: usize, rows: usize) -> KeptMut<'_> {
-        let part = |data| {
-            let data: &mut [f32] = data;
-            let width = data.len().checked_div(rows).unwrap_or(0);
-            &mut data[first * width..(first + count) * width]
-        };
-        Kept {
-            hidden: self.hidden.iter_mut().map(|hidden| part(hidden)).collect(),
-            normalized: part(&mut self.normalized),
-            inverse_std: part(&mut self.inverse_std),
+    /// Becomes room for a block of up to `rows` rows of `mlp`, one after the other.
+    pub fn in_turn(&mut self, mlp: &Mlp<'_>, rows: usize) -> KeptPart<'_> {
+        *self = mlp.kept(rows, false);
+        KeptPart {
+            hidden: self.hidden.iter_mut().map(Stored::all).collect(),
+            normalized: &mut self.normalized,
+            inverse_std: &mut self.inverse_std,
+            rows,
+            in_turn: true,
         }
     }
 }
 
-/// Cuts the data of `rows` rows into parts of `lengths` rows.
-pub(super) fn split<'d, T>(
-    mut data: &'d mut [T],
-    lengths: &[usize],
-    rows: usize,
-) -> Vec<&'d mut [T]> {
-    let width = data.len().checked_div(rows).unwrap_or(0);
-    lengths
-        .iter()
-        .map(|length| data.split_off_mut(..length * width).expect("as many rows"))
-        .collect()
+impl KeptPart<'_> {
+    /// The rows `first` to `first + count`.
+    pub fn block(&mut self, first: usize, count: usize) -> KeptBlock<'_> {
+        let first = if self.in_turn { 0 } else { first };
+        let range = |length: usize| {
+            let width = length.checked_div(self.rows).unwrap_or(0);
+            first * width..(first + count) * width
+        };
+        let of_normalized = range(self.normalized.len());
+        let of_inverse_std = range(self.inverse_std.len());
+        KeptBlock {
+            hidden: (self.hidden.iter_mut())
+                .map(|hidden| hidden.block(range(hidden.len())))
+                .collect(),
+            normalized: &mut self.normalized[of_normalized],
+            inverse_std: &mut self.inverse_std[of_inverse_std],
+        }
+    }
 }

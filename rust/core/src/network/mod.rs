@@ -20,6 +20,7 @@ mod check;
 mod matrix;
 mod mlp;
 mod rows;
+mod stored;
 mod vector;
 
 use std::ops::Range;
@@ -27,10 +28,10 @@ use std::ops::Range;
 pub use mlp::{Linear, Mlp, Norm, Precision};
 
 use crate::threads::{self, Team, Threads};
-use bf16::Stored;
 use buffer::Buffer;
 use matrix::{End, Matrix, Start};
-use mlp::{Factor, Input, Kept, KeptMut, split};
+use mlp::{Factor, Input, Kept, KeptPart};
+use stored::{Stored, StoredMut, split};
 
 /// Rows that go through a perceptron at once: whole tiles, of six rows in float32 and of 32 in
 /// bf16.
@@ -161,7 +162,8 @@ impl Network<'_> {
     ) -> (Vec<Vec<f32>>, Option<Tape>) {
         let width = self.width();
         let count = self.node_count(&features);
-        let rows = |mlp: &Mlp<'_>, rows| keep.then(|| mlp.kept(rows));
+        let rounded = |mlp: &Mlp<'_>| mlp.precision() == Precision::Bf16;
+        let rows = |mlp: &Mlp<'_>, rows| keep.then(|| mlp.kept(rows, rounded(mlp)));
 
         let mut node_encoder = rows(&self.node_encoder, count);
         let mut nodes = Buffer::any(count * width);
@@ -176,21 +178,16 @@ impl Network<'_> {
             &self.node_encoder,
             &encoder_inputs,
             &mut node_encoder,
-            &mut nodes,
+            StoredMut::Whole(&mut nodes),
         );
 
-        let mut edges = Buffer::default();
-        let encoder = self.edge_encoder.as_ref();
-        let rounded = encoder.is_some_and(|mlp| mlp.precision() == Precision::Bf16);
-        // Whether they lie there in bf16.
-        let packed = rounded && !keep;
+        let mut edges = Stored::default();
         let mut edge_encoder = None;
         let mut parts = Vec::new();
-        if let (Some((values, graph)), Some(encoder)) = (features.edges, encoder) {
+        if let (Some((values, graph)), Some(encoder)) = (features.edges, &self.edge_encoder) {
             let edge_count = graph.senders.len();
             parts = graph.parts();
-            let numbers = edge_count * width;
-            edges = Buffer::any(if packed { numbers.div_ceil(2) } else { numbers });
+            edges = Stored::any(edge_count * width, rounded(encoder) && !keep);
             edge_encoder = rows(encoder, edge_count);
             let lengths: Vec<usize> = parts.iter().map(|part| part.edges.len()).collect();
             let pass = Pass {
@@ -199,11 +196,7 @@ impl Network<'_> {
                 team,
             };
             let inputs = [whole_input(encoder, values)];
-            if packed {
-                pass.forward(encoder, &inputs, &mut None, edges.packed(numbers));
-            } else {
-                pass.forward(encoder, &inputs, &mut edge_encoder, &mut edges);
-            }
+            pass.forward(encoder, &inputs, &mut edge_encoder, edges.all());
         }
 
         let mut layers = Vec::new();
@@ -222,12 +215,7 @@ impl Network<'_> {
                     parts: &parts,
                     team,
                 };
-                if packed {
-                    let edges = edges.packed(graph.senders.len() * width);
-                    edge_pass.forward(&projected, &mut None, edges, &mut incoming);
-                } else {
-                    edge_pass.forward(&projected, &mut edge, &mut edges, &mut incoming);
-                }
+                edge_pass.forward(&projected, &mut edge, edges.all(), &mut incoming);
             }
             pass.update_nodes(&layer.node, &incoming, &mut nodes, &mut node);
             if let Some(node) = node {
@@ -244,7 +232,8 @@ impl Network<'_> {
             .map(|head| {
                 let mut kept = rows(head, count);
                 let mut out = vec![0.0; count * head.outputs()];
-                pass.forward(head, &[whole_input(head, &nodes)], &mut kept, &mut out);
+                let inputs = [whole_input(head, &nodes)];
+                pass.forward(head, &inputs, &mut kept, StoredMut::Whole(&mut out));
                 heads.extend(kept);
                 out
             })
@@ -255,7 +244,7 @@ impl Network<'_> {
             layers,
             heads,
             nodes,
-            edges,
+            edges: edges.into_whole(),
         });
         (outputs, tape)
     }
@@ -490,37 +479,15 @@ impl<'r> Input<'r> {
     }
 }
 
-/// Where a part's forward pass leaves what the backward pass needs: for all of its rows, or, where
-/// nothing goes backward, for one block after the other in the same place.
-enum Place<'k> {
-    Rows(KeptMut<'k>, usize),
-    Block(Kept),
-}
-
-impl Place<'_> {
-    /// One place per part.
-    fn of<'k>(
-        kept: &'k mut Option<Kept>,
-        mlp: &Mlp<'_>,
-        lengths: &[usize],
-        rows: usize,
-    ) -> Vec<Place<'k>> {
-        match kept {
-            Some(kept) => (kept.parts(lengths, rows).into_iter().zip(lengths))
-                .map(|(part, &length)| Place::Rows(part, length))
-                .collect(),
-            None => lengths
-                .iter()
-                .map(|_| Place::Block(mlp.kept(BLOCK)))
-                .collect(),
-        }
-    }
-
-    fn block(&mut self, first: usize, count: usize) -> KeptMut<'_> {
-        match self {
-            Place::Rows(kept, rows) => kept.block(first, count, *rows),
-            Place::Block(kept) => kept.block(0, count, BLOCK),
-        }
+/// What each part keeps; `None` where nothing goes backward.
+fn kept_parts<'k>(
+    kept: &'k mut Option<Kept>,
+    lengths: &[usize],
+    rows: usize,
+) -> Vec<Option<KeptPart<'k>>> {
+    match kept {
+        Some(kept) => kept.parts(lengths, rows).into_iter().map(Some).collect(),
+        None => lengths.iter().map(|_| None).collect(),
     }
 }
 
@@ -533,34 +500,34 @@ struct Pass<'p> {
 
 impl Pass<'_> {
     /// `out` becomes the perceptron of the rows of `inputs`.
-    fn forward<S: Stored>(
+    fn forward(
         &self,
         mlp: &Mlp<'_>,
         inputs: &[Input<'_>],
         kept: &mut Option<Kept>,
-        out: &mut [S],
+        out: StoredMut<'_>,
     ) {
         let width = mlp.outputs();
         let items: Vec<_> = starts(self.lengths)
-            .zip(Place::of(kept, mlp, self.lengths, self.rows))
-            .zip(split(out, self.lengths, self.rows))
+            .zip(kept_parts(kept, self.lengths, self.rows))
+            .zip(out.parts(self.lengths, self.rows))
             .collect();
-        self.team.map(items, |((start, mut place), out)| {
-            let mut room = S::room(BLOCK * width);
-            for ((first, count), out) in
-                blocks(out.len() / width).zip(out.chunks_mut(BLOCK * width))
-            {
+        self.team.map(items, |((start, kept), mut out)| {
+            let mut room = Kept::default();
+            let mut kept = kept.unwrap_or_else(|| room.in_turn(mlp, BLOCK));
+            for (first, count) in blocks(out.len() / width) {
                 let inputs: Vec<_> = inputs
                     .iter()
                     .map(|input| input.block(start + first, count))
                     .collect();
+                let mut out = out.block(first * width..(first + count) * width);
                 mlp.forward(
                     &inputs,
                     |_, bias| Start::Row(bias),
-                    &mut place.block(first, count),
-                    S::begin(out, &mut room),
+                    &mut kept.block(first, count),
+                    out.numbers,
                 );
-                S::put(out, &room);
+                out.put();
             }
         });
     }
@@ -575,10 +542,12 @@ impl Pass<'_> {
     ) {
         let width = mlp.outputs();
         let items: Vec<_> = starts(self.lengths)
-            .zip(Place::of(kept, mlp, self.lengths, self.rows))
+            .zip(kept_parts(kept, self.lengths, self.rows))
             .zip(split(nodes, self.lengths, self.rows))
             .collect();
-        self.team.map(items, |((start, mut place), nodes)| {
+        self.team.map(items, |((start, kept), nodes)| {
+            let mut room = Kept::default();
+            let mut kept = kept.unwrap_or_else(|| room.in_turn(mlp, BLOCK));
             let mut update = Buffer::any(BLOCK * width);
             for ((first, count), nodes) in
                 blocks(nodes.len() / width).zip(nodes.chunks_mut(BLOCK * width))
@@ -590,7 +559,7 @@ impl Pass<'_> {
                     width,
                     column,
                 };
-                let mut kept = place.block(first, count);
+                let mut kept = kept.block(first, count);
                 if incoming.is_empty() {
                     mlp.forward(&[own], |_, bias| Start::Row(bias), &mut kept, update);
                 } else {
@@ -623,7 +592,7 @@ impl Pass<'_> {
             let rows = nodes.len() / width;
             for ((first, count), nodes) in blocks(rows).zip(nodes.chunks_mut(BLOCK * width)) {
                 let update = &mut update[..nodes.len()];
-                mlp.outputs_again(&kept.block(first, count, rows), update);
+                mlp.outputs_again(&kept.block(first, count), update);
                 rows::subtract(nodes, update);
             }
         });
@@ -690,9 +659,9 @@ impl Pass<'_> {
                     gradient.copy_from_slice(&outputs[row * width..(row + count) * width]);
                     let inputs: Vec<_> =
                         inputs.iter().map(|input| input.block(row, count)).collect();
-                    let kept = kept.block(first, count, length);
-                    let before =
-                        mlp.backward(&inputs, &kept, count, [&mut here, &mut there], &mut sum);
+                    let mut kept = kept.block(first, count);
+                    let buffers = [&mut here[..], &mut there[..]];
+                    let before = mlp.backward(&inputs, &mut kept, count, buffers, &mut sum);
                     for ((target, column), input) in targets.iter_mut().zip(&inputs) {
                         let target =
                             &mut target[first * input.width..(first + count) * input.width];
@@ -773,11 +742,11 @@ impl EdgePass<'_> {
     }
 
     /// Adds its message to every edge, and the sum of a receiver's messages to `incoming`.
-    fn forward<S: Stored>(
+    fn forward(
         &self,
         projected: &[f32],
         kept: &mut Option<Kept>,
-        edges: &mut [S],
+        edges: StoredMut<'_>,
         incoming: &mut [f32],
     ) {
         let &Self {
@@ -787,21 +756,22 @@ impl EdgePass<'_> {
         let (lengths, nodes) = self.part_lengths();
         let count = graph.senders.len();
         let items: Vec<_> = (self.parts.iter())
-            .zip(Place::of(kept, mlp, &lengths, count))
-            .zip(split(edges, &lengths, count))
+            .zip(kept_parts(kept, &lengths, count))
+            .zip(edges.parts(&lengths, count))
             .zip(split(incoming, &nodes, graph.offsets.len() - 1))
             .collect();
-        team.map(items, |(((part, mut place), edges), incoming)| {
-            let (mut messages, mut room) = (Buffer::any(BLOCK * width), S::room(BLOCK * width));
-            for ((first, count), stored) in
-                blocks(part.edges.len()).zip(edges.chunks_mut(BLOCK * width))
-            {
-                let edges = S::take(stored, &mut room);
+        team.map(items, |(((part, kept), mut edges), incoming)| {
+            let mut room = Kept::default();
+            let mut kept = kept.unwrap_or_else(|| room.in_turn(mlp, BLOCK));
+            let mut messages = Buffer::any(BLOCK * width);
+            for (first, count) in blocks(part.edges.len()) {
+                let mut edges = edges.block(first * width..(first + count) * width);
+                edges.take();
                 let here = part.edges.start + first..part.edges.start + first + count;
                 let (senders, receivers) = (&graph.senders[here.clone()], &graph.receivers[here]);
                 let messages = &mut messages[..count * width];
                 let own = Input {
-                    rows: edges,
+                    rows: edges.numbers,
                     width,
                     column: 2 * width,
                 };
@@ -811,11 +781,11 @@ impl EdgePass<'_> {
                         rows::gather_ends(rows, bias, projected, receivers, senders);
                         Start::There
                     },
-                    &mut place.block(first, count),
+                    &mut kept.block(first, count),
                     messages,
                 );
-                rows::add(edges, messages);
-                S::put(stored, &room);
+                rows::add(edges.numbers, messages);
+                edges.put();
                 rows::add_at(incoming, width, messages, receivers, part.nodes.start);
             }
         });
@@ -856,7 +826,7 @@ impl EdgePass<'_> {
                 let receivers = &graph.receivers[row..row + count];
                 let range = first * width..(first + count) * width;
                 let (edges, to_edges) = (&mut edges[range.clone()], &mut to_edges[range.clone()]);
-                let kept = kept.block(first, count, part.edges.len());
+                let mut kept = kept.block(first, count);
                 let message = &mut there[..count * width];
                 mlp.outputs_again(&kept, message);
                 rows::subtract(edges, message);
@@ -867,7 +837,8 @@ impl EdgePass<'_> {
                     width,
                     column: 2 * width,
                 };
-                let before = mlp.backward(&[own], &kept, count, [&mut here, &mut there], &mut sum);
+                let buffers = [&mut here[..], &mut there[..]];
+                let before = mlp.backward(&[own], &mut kept, count, buffers, &mut sum);
                 mlp.add_input_gradient(before, 2 * width, width, to_edges);
                 to_first[range].copy_from_slice(before);
                 rows::add_at(to_receivers, width, before, receivers, part.nodes.start);
@@ -1391,12 +1362,27 @@ mod tests {
 
     #[test]
     fn packed_numbers_are_rounded_ones() {
-        let mut values = numbers(3, 2 * 33);
-        let mut buffer = Buffer::any(33);
-        u16::put(buffer.packed(66), &values);
-        let mut room = vec![0.0; 70];
-        let taken = u16::take(&mut buffer.packed(66)[..65], &mut room);
+        let mut values = numbers(3, 66);
+        for packed in [false, true] {
+            let mut stored = Stored::any(66, packed);
+            let mut all = stored.all();
+            let mut block = all.block(0..66);
+            block.numbers.copy_from_slice(&values);
+            block.put();
+            let mut parts = stored.all().parts(&[4, 7], 11).into_iter();
+            for place in [0..24, 24..66] {
+                let mut part = parts.next().unwrap();
+                assert_eq!(part.len(), place.len());
+                let mut block = part.block(6..place.len());
+                block.take();
+                let mut expected = values[place][6..].to_vec();
+                if packed {
+                    bf16::round(&mut expected);
+                }
+                assert!(block.numbers == expected);
+            }
+        }
         bf16::round(&mut values);
-        assert!(taken == &values[..65]);
+        assert!(values != numbers(3, 66));
     }
 }
