@@ -129,18 +129,15 @@ impl<T: Scalar, const D: usize, const PERIODIC: bool, const UNIFORM: bool> Work
                 coming.gather::<BLOCK, UNIFORM>(self.search, cells.runs());
             }
             for receiver in receivers {
-                let near =
-                    candidates.near::<BLOCK, _, PERIODIC, UNIFORM>(lanes, self.search, receiver);
                 let row = rows.next(candidates.count, self.budget)?.as_mut_ptr();
                 let mut n = 0;
-                for start in (0..candidates.count).step_by(BLOCK) {
-                    // SAFETY: a block of candidates begins at `start`, and the row has
-                    // room for a block behind all of them.
-                    n += unsafe {
-                        let senders = block(&candidates.index, start);
-                        lanes.append(near(start), senders, row.add(n).cast())
-                    };
-                }
+                candidates.near::<BLOCK, _, PERIODIC, UNIFORM>(
+                    lanes,
+                    self.search,
+                    receiver,
+                    // SAFETY: the row has room for a block behind all candidates.
+                    |near, senders| n += unsafe { lanes.append(near, senders, row.add(n).cast()) },
+                );
                 rows.finish(n);
             }
             let Some(next) = next else { break };
@@ -206,41 +203,44 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
             }
             end += run.len();
         }
-        self.coords[0][end..room].fill(T::NAN);
+        let behind = self.coords[0][end..].first_chunk_mut::<BLOCK>();
+        *behind.expect("room for a block") = [T::NAN; BLOCK];
     }
 
-    /// A function that tells which candidates are within the cutoff of the sorted particle
-    /// `receiver`: one bit for each of the block from a candidate on.
+    /// Tells `found`, block after block, which candidates are within the cutoff of the sorted
+    /// particle `receiver`, one bit each, and who they are.
     #[inline(always)]
     fn near<const BLOCK: usize, L: Lanes<BLOCK>, const PERIODIC: bool, const UNIFORM: bool>(
         &self,
         lanes: L,
         search: &Search<T, D>,
         receiver: usize,
-    ) -> impl Fn(usize) -> u16 {
+        mut found: impl FnMut(u16, &[i32; BLOCK]),
+    ) {
         let here: [T; D] = std::array::from_fn(|a| search.grid.coords[a][receiver]);
-        let period = search.period;
         let limit = match &search.limits {
             &Limits::Uniform(limit) => limit,
             Limits::PerParticle(limits) => limits[receiver],
         };
-        move |start| {
+        for start in (0..self.count).step_by(BLOCK) {
             let mut distances = [T::default(); BLOCK];
             for a in 0..D {
-                // SAFETY: `start` is a candidate.
+                // SAFETY: there is room for a block behind the candidates.
                 let there: &[T; BLOCK] = unsafe { block(&self.coords[a], start) };
                 for l in 0..BLOCK {
-                    let d = separation::<T, PERIODIC>(here[a], there[l], period[a]);
+                    let d = separation::<T, PERIODIC>(here[a], there[l], search.period[a]);
                     distances[l] = distances[l] + d * d;
                 }
             }
-            if UNIFORM {
+            let near = if UNIFORM {
                 lanes.at_most(&distances, &[limit; BLOCK])
             } else {
                 // SAFETY: as above.
                 let theirs: &[T; BLOCK] = unsafe { block(&self.limits, start) };
                 lanes.at_most(&distances, &theirs.map(|theirs| theirs.greater(limit)))
-            }
+            };
+            // SAFETY: as above.
+            found(near, unsafe { block(&self.index, start) });
         }
     }
 }

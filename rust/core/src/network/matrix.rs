@@ -154,9 +154,9 @@ vectorized! {
         b: Matrix<'_>,
         end: End<'_>,
     ) {
-        tiles::<Lanes, { <Lanes as Vector>::TILE.0 }, { <Lanes as Vector>::TILE.1 }>(
-            out, stride, start, a, b, end,
-        )
+        const TILE: (usize, usize) = <Lanes as Vector>::TILE;
+        // SAFETY: the processor has the vectors that this is compiled for.
+        unsafe { tiles::<Lanes, { TILE.0 }, { TILE.1 }>(out, stride, start, a, b, end) }
     }
 }
 
@@ -173,8 +173,11 @@ struct Task<'a> {
 }
 
 /// Tile by tile of `R` rows, at most 8, and `C` vectors.
+///
+/// # Safety
+/// The processor has such vectors.
 #[inline(always)]
-fn tiles<V: Vector, const R: usize, const C: usize>(
+unsafe fn tiles<V: Vector, const R: usize, const C: usize>(
     out: &mut [f32],
     stride: usize,
     start: Start<'_>,
@@ -206,8 +209,7 @@ fn tiles<V: Vector, const R: usize, const C: usize>(
         end,
     };
     let mut column = 0;
-    // SAFETY: as just asserted, all that is read and written lies in the slices; the caller has
-    // chosen vectors that the processor has.
+    // SAFETY: as just asserted, all that is read and written lies in the slices.
     unsafe {
         while column + C * V::LANES <= columns {
             strip::<V, R, C>(task, column);
