@@ -104,7 +104,7 @@ class AdaptiveConfig:
     factor: float = 1.267
     """How many times farther."""
     low_tau: float = 30.0
-    """Two-sided alone: percentile below which a particle sees less far."""
+    """Two-sided alone: percentile, at most tau, below which a particle sees less far."""
     low_factor: float = 0.8
     """Two-sided alone: how many times as far."""
 
@@ -168,8 +168,6 @@ class RolloutConfig:
             one_step_every=COUNT,
             seed=NOT_NEGATIVE,
         )
-        if self.policy == "two-sided":
-            self.adaptive.require_two_sides()
 
 
 @dataclass(frozen=True)
@@ -283,8 +281,6 @@ class TrainConfig:
             test_trajectories=COUNT,
             test_horizon=COUNT,
         )
-        if self.graph == "two-sided":
-            self.adaptive.require_two_sides()
         if self.variance_ahead and (self.loss != "decoupled" or self.unroll < 2):
             raise ValueError(
                 f"variance_ahead: needs the loss decoupled and unroll >= 2; got {self.loss} and "

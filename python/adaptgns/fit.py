@@ -77,6 +77,7 @@ class Trainer:
         *,
         train: Trajectories,
         valid: Trajectories | None,
+        types: tuple[int, ...] | None = None,
         checkpoint: Checkpoint | None = None,
         processes: Processes = ALONE,
     ) -> None:
@@ -90,8 +91,10 @@ class Trainer:
                 f"batch: got {config.batch} samples a step for {processes.count} processes; "
                 "accepted is at least one each"
             )
+        if config.graph == "two-sided":
+            config.adaptive.require_two_sides()
         self.config, self.metadata, self.folder, self.valid = config, metadata, folder, valid
-        self.processes = processes
+        self.types, self.processes = types, processes
         self.device = torch_device(config.device)
         torch.manual_seed(config.seed)
         self.simulator = build_simulator(config, metadata).to(self.device)
@@ -101,7 +104,6 @@ class Trainer:
         self.validated = True
         if checkpoint is not None:
             self._restore(checkpoint)
-        self.types = train.types()
         self.windows = Windows(train, metadata, config, noise=config.noise)
         if not len(self.windows):
             raise ValueError(
@@ -131,6 +133,8 @@ class Trainer:
             state.setdefault(int(index), {})[key] = tensor
         groups = self.optimizer.state_dict()["param_groups"]
         self.optimizer.load_state_dict({"state": state, "param_groups": groups})
+        if self.types is not None:  # as well as those of what it was trained on before
+            self.types = tuple(sorted({*self.types, *(checkpoint.types or ())}))
         self.step, self.best_score = checkpoint.step, checkpoint.best_score
         self.validated = checkpoint.validated or self.valid is None
 

@@ -112,6 +112,9 @@ class TwoSided:
     needs_sigma: ClassVar[bool] = True
     rule: AdaptiveConfig
 
+    def __post_init__(self) -> None:
+        self.rule.require_two_sides()
+
     def edges(self, state: State) -> Edges:
         if state.sigma is None:
             return state.base()

@@ -187,18 +187,9 @@ def open_data(
     DataError where there is none, or none that the model can step forward.
     """
     folder = dataset_folder(data or checkpoint.config.data)
-    notes = checkpoint.metadata.check_suits(folder)
-    trajectories = open_split(folder, split)
-    if checkpoint.types is not None:
-        there, known = trajectories.types(), checkpoint.types
-        if not set(there) <= set(known):
-            notes.append(
-                f"{trajectories.path}: has particles of types {', '.join(map(str, there))}; the "
-                f"model was trained on {', '.join(map(str, known))} and knows no others"
-            )
-    for note in notes:
+    for note in checkpoint.metadata.check_suits(folder):
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
-    return trajectories
+    return open_split(folder, split)
 
 
 def write_rollouts(config: RolloutConfig, console: Console) -> None:
@@ -217,6 +208,7 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
                 highlight=False,
                 soft_wrap=True,
             )
+    known = set(checkpoint.types or ())
     network = "GNS" if simulator.config.edges else "MLP"
     settings = {
         **to_json(config),
@@ -231,6 +223,16 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
     ):
         for index in progress.track(range(count), description=f"{config.policy} rollouts"):
             trajectory = split[index]
+            new = set(trajectory.particle_type.tolist()) - known
+            if checkpoint.types is not None and new:
+                known |= new
+                console.print(
+                    f"note: trajectory {trajectory.name} has particles of type "
+                    f"{', '.join(map(str, sorted(new)))}; the model was trained on type "
+                    f"{', '.join(map(str, checkpoint.types))} alone",
+                    highlight=False,
+                    soft_wrap=True,
+                )
             frames = len(trajectory.positions) - HISTORY
             horizon = frames if config.steps is None else min(config.steps, frames)
 

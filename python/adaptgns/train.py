@@ -125,14 +125,15 @@ def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path
         train_split, valid_split, test_split = (
             open_split(data, split) for split in ("train", "valid", "test")
         )
-        for split in (train_split, valid_split, test_split):  # before anything depends on them
-            check_split(split, metadata)
+        # Before anything depends on them.
+        types, *_ = (check_split(s, metadata) for s in (train_split, valid_split, test_split))
         trainer = Trainer(
             config,
             metadata,
             folder,
             train=train_split,
             valid=valid_split,
+            types=types,
             checkpoint=checkpoint,
             processes=group,
         )

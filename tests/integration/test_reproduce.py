@@ -18,7 +18,8 @@ from adaptgns.data.trajectories import open_split
 from adaptgns.fit import Diverged
 from adaptgns.reproduce import ReproduceConfig, main, reproduce, study_of
 from adaptgns.reproduce.estimates import seconds
-from adaptgns.reproduce.profiles import PROFILES, Model
+from adaptgns.reproduce.figures import COLOURS
+from adaptgns.reproduce.profiles import PROFILES, Model, ProfileName
 from adaptgns.reproduce.report import MARKERS, write_into
 from adaptgns.reproduce.results import Estimate, Results, estimate
 from adaptgns.reproduce.runs import DataSet, Run, Study, StudyError, matched_radius
@@ -563,6 +564,12 @@ def test_differences_are_paired(made: ReproduceConfig) -> None:
     assert found.mean == pytest.approx(
         one.estimate("mse@10").mean - other.estimate("mse@10").mean, rel=1e-6, abs=1e-12
     )
+
+
+@pytest.mark.parametrize("preset", ["laptop", "full"])
+def test_models_of_the_same_length_differ_in_colour(preset: ProfileName) -> None:
+    names = [model.name for model in PROFILES[preset].models if model.share == 1]
+    assert len({COLOURS[name] for name in names}) == len(names)
 
 
 def test_only_seeds_of_both_are_compared(made: ReproduceConfig) -> None:

@@ -36,7 +36,7 @@ def test_good_data_passes(tmp_path: Path, metadata: Metadata) -> None:
     walls = inside()
     walls[0, 0] = 0.1, 0.9
     save(tmp_path / "train.h5", walls, inside(20))
-    check_split(open_split(tmp_path, "train"), metadata)
+    assert check_split(open_split(tmp_path, "train"), metadata) == (5,)
 
 
 @pytest.mark.usefixtures("block")
@@ -60,8 +60,14 @@ def test_periodic_axes_and_kinematic_particles_have_no_outside(
     positions = inside()
     positions[:, 0] = 5.0
     positions[:, 1:, 1] = -3.0
-    save(tmp_path / "train.h5", positions, types=[3, 5, 5])
-    check_split(open_split(tmp_path, "train"), replace(metadata, periodic=(False, True)))
+    save(tmp_path / "train.h5", positions, types=[7, 5, 3])
+    with h5py.File(tmp_path / "train.h5", "a") as file:
+        file["00001/position"] = inside(particles=1).astype(np.float32)
+        file["00001/particle_type"] = [6]
+    metadata = replace(metadata, periodic=(False, True), kinematic_types=(3, 7))
+    positions[:, 0] = 5.0
+    types = check_split(open_split(tmp_path, "train"), metadata)
+    assert types == (3, 5, 6, 7), "of all trajectories"
 
 
 @pytest.mark.usefixtures("block")

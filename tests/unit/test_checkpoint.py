@@ -133,16 +133,6 @@ def test_values_outside_their_range_are_refused(
         replace(config, **{name: value})
 
 
-def test_two_sides_must_not_overlap() -> None:
-    overlapping = AdaptiveConfig(tau=20)
-    rollout = RolloutConfig(Path("run"), Path("out.h5"), adaptive=overlapping, policy="adaptive")
-    message = "low_tau: got 30; accepted for two-sided graphs are numbers up to tau, 20"
-    with pytest.raises(ValueError, match=message):
-        replace(rollout, policy="two-sided")
-    with pytest.raises(ValueError, match=message):
-        TrainConfig(adaptive=overlapping, graph="two-sided")
-
-
 @pytest.mark.parametrize("name", ["waterdrop", "sand"])
 def test_pretrained_models_come_with_the_package(name: str) -> None:
     checkpoint = read_checkpoint(Path(name))

@@ -32,7 +32,14 @@ from tests.conftest import graph_of
 QUIET = Console(quiet=True)
 
 
-def trainer(drops: Path, folder: Path, config: TrainConfig, *, resume: bool = False) -> Trainer:
+def trainer(
+    drops: Path,
+    folder: Path,
+    config: TrainConfig,
+    *,
+    resume: bool = False,
+    types: tuple[int, ...] = (5,),
+) -> Trainer:
     folder.mkdir(exist_ok=True)
     return Trainer(
         config,
@@ -40,12 +47,22 @@ def trainer(drops: Path, folder: Path, config: TrainConfig, *, resume: bool = Fa
         folder,
         train=open_split(drops, "train"),
         valid=open_split(drops, "valid"),
+        types=types,
         checkpoint=read_checkpoint(folder / LAST) if resume else None,
     )
 
 
 def log(folder: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_two_sides_that_overlap_are_not_trained_on(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    config = replace(small_config, loss="nll", adaptive=AdaptiveConfig(tau=20, low_tau=30))
+    trainer(drops, tmp_path, replace(config, graph="adaptive"))
+    with pytest.raises(ValueError, match="low_tau: got 30; accepted for two-sided graphs"):
+        trainer(drops, tmp_path, replace(config, graph="two-sided"))
 
 
 @pytest.mark.parametrize("graph", ["base", "adaptive", "two-sided"])
@@ -97,7 +114,8 @@ def test_metrics_best_checkpoint_and_log_after_a_resume(
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"step": 99, "loss": 1}\n{"step": 100, "lo')
     longer = replace(small_config, steps=14)
-    trainer(drops, tmp_path, longer, resume=True).run(QUIET)
+    trainer(drops, tmp_path, longer, resume=True, types=(3,)).run(QUIET)
+    assert read_checkpoint(tmp_path / LAST).types == (3, 5), "of what came before, too"
     assert [e["step"] for e in log(tmp_path)] == [6, 12, 12, 14, 14]
     assert any((tmp_path / "tensorboard").iterdir())
 

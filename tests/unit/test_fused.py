@@ -195,8 +195,10 @@ def test_a_variance_alone_teaches_the_rest_nothing(with_edges: bool) -> None:
             assert gradient is None or not gradient.any()
 
 
-def test_gradients_can_be_taken_twice_of_one_pass() -> None:
+@pytest.mark.parametrize("precision", ["float32", "bf16"])
+def test_gradients_can_be_taken_twice_of_one_pass(precision: Precision) -> None:
     made = Case()
+    made.network.precision = precision
     out = made.network(made.node_features, made.edge_features, made.graph).acceleration.sum()
     parameters = list(made.network.decoder.parameters()) + list(made.network.layers[0].parameters())
     first = torch.autograd.grad(out, parameters, retain_graph=True)

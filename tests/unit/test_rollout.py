@@ -223,6 +223,16 @@ def test_variance_is_needed_by_two_pass(metadata: Metadata, trajectory: Trajecto
         list(steps(without, trajectory, make_policy("two-pass", RULE, k=0, seed=0), 1))
 
 
+def test_two_sides_may_meet_but_not_overlap() -> None:
+    for policy in ("adaptive", "two-sided"):
+        make_policy(policy, AdaptiveConfig(tau=30, low_tau=30), k=0, seed=0)
+    overlapping = AdaptiveConfig(tau=20, low_tau=30)
+    make_policy("adaptive", overlapping, k=0, seed=0)
+    message = "low_tau: got 30; accepted for two-sided graphs are numbers up to tau, 20"
+    with pytest.raises(ValueError, match=message):
+        make_policy("two-sided", overlapping, k=0, seed=0)
+
+
 def test_too_long_a_horizon_is_named(simulator: Simulator, trajectory: Trajectory) -> None:
     with pytest.raises(ValueError, match=r"count: .* has 40 frames, so 1 to 34 steps.*got 35"):
         list(steps(simulator, trajectory, Fixed(), 35))
@@ -300,10 +310,10 @@ def test_types_that_the_model_was_not_trained_on_are_told(
     drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for model, told in (("sand", True), ("waterdrop", False)):
-        options = ["--checkpoint", model, "--data", str(drops), "--trajectories", "1"]
-        main([*options, "--steps", "1", "--out", str(tmp_path / f"{model}.h5")])
-        message = "has particles of types 5; the model was trained on 6 and knows no others"
-        assert (message in capsys.readouterr().out) == told
+        options = ["--checkpoint", model, "--data", str(drops), "--trajectories", "2"]
+        main([*options, "--split", "train", "--steps", "1", "--out", str(tmp_path / model)])
+        message = "has particles of type 5; the model was trained on type 6 alone"
+        assert capsys.readouterr().out.count(message) == told
 
 
 def test_a_horizon_behind_the_end_of_the_data_is_told(

@@ -36,8 +36,11 @@ class Problem:
     fatal: bool
 
 
-def check_split(trajectories: Trajectories, metadata: Metadata) -> None:
+def check_split(trajectories: Trajectories, metadata: Metadata) -> tuple[int, ...]:
     """Reads all of a split and raises or warns about what is wrong with its contents.
+
+    Returns:
+        The particle types that occur, ascending.
 
     Raises:
         DataError: a trajectory is damaged or not finite.
@@ -45,15 +48,20 @@ def check_split(trajectories: Trajectories, metadata: Metadata) -> None:
     Warns:
         DataWarning: particles lie outside the bounds.
     """
-    for problem in find_problems(trajectories, metadata):
+    types: set[int] = set()
+    for problem in find_problems(trajectories, metadata, types):
         if problem.fatal:
             raise DataError(problem.message)
         warnings.warn(problem.message, DataWarning, stacklevel=2)
+    return tuple(sorted(types))
 
 
-def find_problems(trajectories: Trajectories, metadata: Metadata) -> Iterator[Problem]:
+def find_problems(
+    trajectories: Trajectories, metadata: Metadata, types: set[int] | None = None
+) -> Iterator[Problem]:
     """All that `check_split` would tell: one problem per unusable trajectory, then one for the
-    particles outside the bounds, with their number and the first of them."""
+    particles outside the bounds, with their number and the first of them. The particle types that
+    occur are added to `types`."""
     outside = _Outside(metadata)
     for index, frames in enumerate(trajectories.lengths.tolist()):
         values = int(trajectories.particle_counts[index]) * trajectories.dim
@@ -62,6 +70,8 @@ def find_problems(trajectories: Trajectories, metadata: Metadata) -> Iterator[Pr
             for start in range(0, frames, step):
                 block = trajectories.window(index, start, min(start + step, frames))
                 outside.look_at(block.name, start, block.positions, block.particle_type)
+                if types is not None and start == 0:
+                    types.update(np.unique(block.particle_type).tolist())
         except DataError as error:
             yield Problem(str(error), fatal=True)
     if outside.count:

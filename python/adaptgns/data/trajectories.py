@@ -94,13 +94,6 @@ class Trajectories:
             )
         return trajectory
 
-    def types(self) -> tuple[int, ...]:
-        """The particle types that occur, ascending; reads a frame of every trajectory."""
-        seen: set[int] = set()
-        for index in range(len(self)):
-            seen.update(self.window(index, 0, 1).particle_type.tolist())
-        return tuple(sorted(seen))
-
     @cached_property
     def material_properties(self) -> int:
         """Columns of `material_property` in the first trajectory; 0 where there are none."""

@@ -40,6 +40,7 @@ COLOURS = {
     "decoupled-deep": "#1f4d2b",
     "decoupled-ahead": "#3fae8c",
     "nll-middle": "#e58f73",
+    "mse-matched": "#7aa6d8",
     "mse-matched-decoupled": "#5b78b0",
 }
 FIGURE_3 = (("mse", "fixed"), ("nll", "fixed"), ("nll", "adaptive"), ("nll", "random"))

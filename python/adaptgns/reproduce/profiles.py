@@ -160,13 +160,13 @@ DECOUPLED = Model(
     "decoupled",
     policies=("fixed", "adaptive", "random", "two-sided"),
 )
+SHAPED = replace(
+    DECOUPLED,
+    name="decoupled-weight",
+    title="GNS, decoupled, latents shaped with weight 0.1",
+    variance_weight=0.1,
+)
 DECOUPLED_VARIANTS = (
-    replace(
-        DECOUPLED,
-        name="decoupled-weight",
-        title="GNS, decoupled, latents shaped with weight 0.1",
-        variance_weight=0.1,
-    ),
     replace(
         DECOUPLED,
         name="decoupled-deep",
@@ -174,10 +174,9 @@ DECOUPLED_VARIANTS = (
         variance_layers=3,
     ),
     replace(
-        DECOUPLED,
+        SHAPED,
         name="decoupled-ahead",
         title="GNS, decoupled, sigma of the next step",
-        variance_weight=0.1,
         variance_ahead=True,
     ),
 )
@@ -202,6 +201,7 @@ PAPER_MODELS = (
     NLL,
     MLP,
     DECOUPLED,
+    SHAPED,
     *DECOUPLED_VARIANTS,
     TWO_SIDED_NLL,
     *EARLY,
@@ -224,14 +224,14 @@ ONE_SEED = tuple(
     map(
         one_seed,
         (
-            *DECOUPLED_VARIANTS[1:],
+            *DECOUPLED_VARIANTS,
             BETA_NLL,
             MATCHED_MSE,
             replace(
                 MATCHED_MSE,
                 name="mse-matched-decoupled",
                 title="GNS, MSE, r matched to decoupled's edges",
-                matches="decoupled-weight",
+                matches=SHAPED.name,
             ),
         ),
     )
@@ -347,7 +347,7 @@ PROFILES: dict[ProfileName, Profile] = {
             LONG_NLL,
             LONG_MSE,
             ADAPTIVE_NLL,
-            DECOUPLED_VARIANTS[0],
+            SHAPED,
             DENSER_MSE,
             MIDDLE_NLL,
             *ONE_SEED,

@@ -100,7 +100,7 @@ COMPARISONS: tuple[Comparison, ...] = (
     ("k nearest or all within r, MSE", ("mse", "knn"), ("mse", "fixed")),
     ("GNS or MLP", ("mse", "fixed"), ("mlp", "fixed")),
     ("r 0.019 or 0.015, MSE", ("mse-denser", "fixed"), ("mse", "fixed")),
-    ("adaptive NLL or MSE at matched edges", ("nll", "adaptive"), ("mse-matched", "fixed")),
+    ("adaptive NLL or MSE at its edges", ("nll", "adaptive"), ("mse-matched", "fixed")),
     ("adaptive or r 0.0176, NLL", ("nll", "adaptive"), ("nll-middle", "fixed")),
     ("r 0.0176 or 0.015, NLL", ("nll-middle", "fixed"), ("nll", "fixed")),
     (
@@ -146,12 +146,12 @@ COMPARISONS: tuple[Comparison, ...] = (
     ("two-sided decoupled or fixed MSE: the aim", ("decoupled", "two-sided"), ("mse", "fixed")),
     ("decoupled or MSE, fixed graphs", ("decoupled", "fixed"), ("mse", "fixed")),
     (
-        "adaptive decoupled or MSE at matched edges",
+        "adaptive decoupled or MSE at the edges of NLL",
         ("decoupled", "adaptive"),
         ("mse-matched", "fixed"),
     ),
     (
-        "adaptive decoupled, latents shaped, or MSE at matched edges",
+        "adaptive decoupled, latents shaped, or MSE at its edges",
         ("decoupled-weight", "adaptive"),
         ("mse-matched-decoupled", "fixed"),
     ),

@@ -9,7 +9,7 @@ use super::bf16::{self, Right};
 use super::buffer::Buffer;
 use super::matrix::{End, Matrix, Start, product};
 use super::rows;
-use super::stored::{Block, Stored, StoredMut, split};
+use super::stored::{Held, Stored, StoredMut};
 
 /// What the factors of a map's products are rounded to; sums are in float32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -210,27 +210,25 @@ pub(super) struct Input<'a> {
 /// What the backward pass needs of a number of rows.
 #[derive(Default)]
 pub(super) struct Kept {
-    /// After each ReLU; in bf16 no more is lost than in the products that they are factors of.
+    /// After each ReLU, rounded as the products round them that they are factors of.
     hidden: Vec<Stored>,
     /// Before the LayerNorm's scale and shift; empty without one.
     normalized: Buffer,
     inverse_std: Buffer,
 }
 
-/// The same of a part of the rows, or, where nothing goes backward, room for one block of them after
-/// the other.
+/// The same of a part of the rows, or, where nothing goes backward, of what passes.
 pub(super) struct KeptPart<'k> {
     hidden: Vec<StoredMut<'k>>,
-    normalized: &'k mut [f32],
-    inverse_std: &'k mut [f32],
+    normalized: StoredMut<'k>,
+    inverse_std: StoredMut<'k>,
     rows: usize,
-    in_turn: bool,
 }
 
 /// The same of a block of a part's rows.
 pub(super) struct KeptBlock<'k> {
-    hidden: Vec<Block<'k>>,
-    normalized: &'k mut [f32],
+    hidden: Vec<Held<'k>>,
+    pub normalized: &'k mut [f32],
     inverse_std: &'k mut [f32],
 }
 
@@ -242,9 +240,11 @@ impl<'a> Mlp<'a> {
 
     /// Whether `kept` is what a forward pass of `rows` rows keeps.
     pub(super) fn fits(&self, kept: &Kept, rows: usize) -> bool {
+        let mut hidden = self.hidden();
         let normed = if self.norm.is_some() { rows } else { 0 };
-        (kept.hidden.iter().map(|hidden| hidden.len()))
-            .eq(self.hidden_widths().map(|width| rows * width))
+        (kept.hidden.iter()).all(|kept| {
+            (hidden.next()).is_some_and(|(width, packed)| kept.are(rows * width, packed))
+        }) && hidden.next().is_none()
             && kept.normalized.len() == normed * self.outputs()
             && kept.inverse_std.len() == normed
     }
@@ -254,10 +254,15 @@ impl<'a> Mlp<'a> {
         self.linears[0].precision
     }
 
-    pub(super) fn hidden_widths(&self) -> impl Iterator<Item = usize> {
-        self.linears[..self.linears.len() - 1]
-            .iter()
-            .map(Linear::outputs)
+    /// How wide the rows between its maps are, and whether products round them to bf16.
+    fn hidden(&self) -> impl Iterator<Item = (usize, bool)> {
+        (self.linears.iter().skip(1)).map(|next| (next.inputs(), next.precision == Precision::Bf16))
+    }
+
+    /// How wide its rows are, the first map's inputs apart.
+    pub(super) fn widest(&self) -> usize {
+        let hidden = self.hidden().map(|(width, _)| width);
+        hidden.fold(self.outputs(), usize::max)
     }
 
     /// How many numbers its parameters have: weights and biases in order, then scale and shift.
@@ -268,15 +273,28 @@ impl<'a> Mlp<'a> {
         linears + self.norm.map_or(0, |norm| 2 * norm.scale.len())
     }
 
-    /// Room for what a pass over `rows` rows keeps, `packed` or not.
-    pub(super) fn kept(&self, rows: usize, packed: bool) -> Kept {
+    /// Room for what a pass over `rows` rows keeps.
+    pub(super) fn kept(&self, rows: usize) -> Kept {
         let normed = if self.norm.is_some() { rows } else { 0 };
         Kept {
-            hidden: (self.hidden_widths())
-                .map(|width| Stored::any(rows * width, packed))
+            hidden: (self.hidden())
+                .map(|(width, packed)| Stored::any(rows * width, packed))
                 .collect(),
             normalized: Buffer::any(normed * self.outputs()),
             inverse_std: Buffer::any(normed),
+        }
+    }
+
+    /// The same of a part of `rows` rows that pass.
+    pub(super) fn passing(&self, rows: usize) -> KeptPart<'static> {
+        let normed = if self.norm.is_some() { rows } else { 0 };
+        KeptPart {
+            hidden: (self.hidden())
+                .map(|(width, _)| StoredMut::passing(rows * width))
+                .collect(),
+            normalized: StoredMut::passing(normed * self.outputs()),
+            inverse_std: StoredMut::passing(normed),
+            rows,
         }
     }
 
@@ -325,10 +343,10 @@ impl<'a> Mlp<'a> {
         }
     }
 
-    /// What [`Self::forward`] gave for the rows that `kept` is of.
-    pub(super) fn outputs_again(&self, kept: &KeptBlock<'_>, out: &mut [f32]) {
+    /// What [`Self::forward`] gave for the rows that were `normalized`.
+    pub(super) fn outputs_again(&self, normalized: &[f32], out: &mut [f32]) {
         let norm = self.norm.expect("only what a LayerNorm gave is kept");
-        rows::rescale(out, kept.normalized, norm.scale, norm.shift);
+        rows::rescale(out, normalized, norm.scale, norm.shift);
     }
 
     /// From the gradient of the outputs of a block of `rows` rows to that of its first map's
@@ -409,49 +427,34 @@ impl Kept {
         let mut hidden: Vec<_> = (self.hidden.iter_mut())
             .map(|hidden| hidden.all().parts(lengths, rows).into_iter())
             .collect();
-        split(&mut self.normalized, lengths, rows)
-            .into_iter()
-            .zip(split(&mut self.inverse_std, lengths, rows))
-            .zip(lengths)
-            .map(|((normalized, inverse_std), &rows)| KeptPart {
+        let normalized = StoredMut::Numbers(&mut self.normalized).parts(lengths, rows);
+        let inverse_std = StoredMut::Numbers(&mut self.inverse_std).parts(lengths, rows);
+        (normalized.into_iter().zip(inverse_std).zip(lengths))
+            .map(|((normalized, inverse_std), &length)| KeptPart {
                 hidden: hidden.iter_mut().filter_map(Iterator::next).collect(),
                 normalized,
                 inverse_std,
-                rows,
-                in_turn: false,
+                rows: length,
             })
             .collect()
-    }
-
-    /// Becomes room for a block of up to `rows` rows of `mlp`, one after the other.
-    pub fn in_turn(&mut self, mlp: &Mlp<'_>, rows: usize) -> KeptPart<'_> {
-        *self = mlp.kept(rows, false);
-        KeptPart {
-            hidden: self.hidden.iter_mut().map(Stored::all).collect(),
-            normalized: &mut self.normalized,
-            inverse_std: &mut self.inverse_std,
-            rows,
-            in_turn: true,
-        }
     }
 }
 
 impl KeptPart<'_> {
     /// The rows `first` to `first + count`.
     pub fn block(&mut self, first: usize, count: usize) -> KeptBlock<'_> {
-        let first = if self.in_turn { 0 } else { first };
-        let range = |length: usize| {
-            let width = length.checked_div(self.rows).unwrap_or(0);
-            first * width..(first + count) * width
-        };
-        let of_normalized = range(self.normalized.len());
-        let of_inverse_std = range(self.inverse_std.len());
+        let rows = self.rows;
         KeptBlock {
             hidden: (self.hidden.iter_mut())
-                .map(|hidden| hidden.block(range(hidden.len())))
+                .map(|hidden| hidden.rows(first, count, rows))
                 .collect(),
-            normalized: &mut self.normalized[of_normalized],
-            inverse_std: &mut self.inverse_std[of_inverse_std],
+            normalized: self.normalized.rows(first, count, rows).numbers,
+            inverse_std: self.inverse_std.rows(first, count, rows).numbers,
         }
+    }
+
+    /// Of the rows `first` to `first + count`, what was normalized.
+    pub fn normalized(&mut self, first: usize, count: usize) -> &[f32] {
+        self.normalized.rows(first, count, self.rows).numbers
     }
 }

@@ -22,8 +22,9 @@ impl Stored {
         }
     }
 
-    pub fn len(&self) -> usize {
-        self.length
+    /// Whether they are so many, and lie so.
+    pub fn are(&self, length: usize, packed: bool) -> bool {
+        (self.length, self.packed) == (length, packed)
     }
 
     /// All of them.
@@ -31,7 +32,7 @@ impl Stored {
         if self.packed {
             StoredMut::Packed(self.memory.packed(self.length), Buffer::default())
         } else {
-            StoredMut::Whole(&mut self.memory)
+            StoredMut::Numbers(&mut self.memory)
         }
     }
 
@@ -42,59 +43,76 @@ impl Stored {
     }
 }
 
-/// Some numbers that are stored; where they are packed, with room to work on a block of them.
+/// Some numbers that are stored, or that are not: what comes to be worked on, block after block, is
+/// soon overwritten by the next. Where they don't lie in float32, with room for a block.
 pub(super) enum StoredMut<'s> {
-    Whole(&'s mut [f32]),
+    Numbers(&'s mut [f32]),
     Packed(&'s mut [u16], Buffer),
+    Passing(usize, Buffer),
 }
 
 impl<'s> StoredMut<'s> {
+    /// So many that are not stored.
+    pub fn passing(length: usize) -> Self {
+        Self::Passing(length, Buffer::default())
+    }
+
     /// Cut into parts of `lengths` of their `rows` rows.
     pub fn parts(self, lengths: &[usize], rows: usize) -> Vec<Self> {
         match self {
-            Self::Whole(numbers) => (split(numbers, lengths, rows).into_iter())
-                .map(Self::Whole)
+            Self::Numbers(numbers) => (split(numbers, lengths, rows).into_iter())
+                .map(Self::Numbers)
                 .collect(),
             Self::Packed(packed, _) => (split(packed, lengths, rows).into_iter())
                 .map(|part| Self::Packed(part, Buffer::default()))
                 .collect(),
+            Self::Passing(length, _) => {
+                let width = length.checked_div(rows).unwrap_or(0);
+                (lengths.iter())
+                    .map(|length| Self::passing(length * width))
+                    .collect()
+            }
         }
     }
 
     pub fn len(&self) -> usize {
         match self {
-            Self::Whole(numbers) => numbers.len(),
+            Self::Numbers(numbers) => numbers.len(),
             Self::Packed(packed, _) => packed.len(),
+            Self::Passing(length, _) => *length,
         }
     }
 
     /// Some of them, to be worked on.
-    pub fn block(&mut self, range: Range<usize>) -> Block<'_> {
-        match self {
-            Self::Whole(numbers) => Block {
-                numbers: &mut numbers[range],
-                packed: None,
-            },
-            Self::Packed(packed, room) => {
-                if room.len() < range.len() {
-                    *room = Buffer::any(range.len());
-                }
-                Block {
-                    numbers: &mut room[..range.len()],
-                    packed: Some(&mut packed[range]),
-                }
+    pub fn block(&mut self, range: Range<usize>) -> Held<'_> {
+        fn some(room: &mut Buffer, count: usize) -> &mut [f32] {
+            if room.len() < count {
+                *room = Buffer::any(count);
             }
+            &mut room[..count]
         }
+        let (numbers, packed) = match self {
+            Self::Numbers(numbers) => (&mut numbers[range], None),
+            Self::Packed(packed, room) => (some(room, range.len()), Some(&mut packed[range])),
+            Self::Passing(_, room) => (some(room, range.len()), None),
+        };
+        Held { numbers, packed }
+    }
+
+    /// The rows `first` to `first + count` of `rows`, to be worked on.
+    pub fn rows(&mut self, first: usize, count: usize, rows: usize) -> Held<'_> {
+        let width = self.len().checked_div(rows).unwrap_or(0);
+        self.block(first * width..(first + count) * width)
     }
 }
 
 /// Numbers to work on, of any value where they are stored elsewhere.
-pub(super) struct Block<'b> {
-    pub numbers: &'b mut [f32],
-    packed: Option<&'b mut [u16]>,
+pub(super) struct Held<'h> {
+    pub numbers: &'h mut [f32],
+    packed: Option<&'h mut [u16]>,
 }
 
-impl Block<'_> {
+impl Held<'_> {
     /// Gives them the values that are stored.
     pub fn take(&mut self) {
         if let Some(packed) = &self.packed {
