@@ -8,9 +8,9 @@
 //! the graph alone, and their sums are taken in order: results are the same for any number of
 //! threads.
 //!
-//! The backward pass needs every layer's nodes and edges. It takes them from the last layer's by
-//! undoing one residual after the other, so a step keeps none but the last. What rounding that adds is below
-//! that of the passes themselves, unless LayerNorms scale by a thousand.
+//! The backward pass needs every layer's nodes, edges and sums of messages. It takes them from the
+//! last layer's by undoing one residual after the other, so a step keeps none but the last. What
+//! rounding that adds is below that of the passes themselves, unless LayerNorms scale by a thousand.
 
 #[cfg(target_arch = "x86_64")]
 mod amx;
@@ -103,7 +103,6 @@ pub struct Tape {
 struct LayerTape {
     edge: Kept,
     node: Kept,
-    incoming: Buffer,
 }
 
 /// Gradients of a number by all that it came from.
@@ -222,7 +221,6 @@ impl Network<'_> {
                 layers.push(LayerTape {
                     edge: edge.unwrap_or_default(),
                     node,
-                    incoming,
                 });
             }
         }
@@ -310,20 +308,31 @@ impl Network<'_> {
         for (layer, tape) in self.layers.into_iter().zip(&mut tape.layers).rev() {
             copy_weights(team, &layer, Linear::backward);
             pass.undo(&layer.node, &mut tape.node, &mut nodes);
+            let edge_pass = match (features.edges, &layer.edge, &parts) {
+                (Some((_, graph)), Some(mlp), Some(parts)) => Some(EdgePass {
+                    mlp,
+                    graph,
+                    parts,
+                    team,
+                }),
+                _ => None,
+            };
+            let incoming = (edge_pass.as_ref())
+                .map(|edge_pass| edge_pass.undo(&mut tape.edge, &mut edges, count));
             let gradient = Buffer::copy(&to_nodes);
-            let mut to_incoming = Buffer::zeros(tape.incoming.len());
+            let mut to_incoming = Buffer::zeros(incoming.as_ref().map_or(0, |rows| rows.len()));
             let column = layer.node.linears[0].inputs() - width;
             let own = Input {
                 rows: &nodes,
                 width,
                 column,
             };
-            let summed = Input {
-                rows: &tape.incoming,
-                width,
-                column: 0,
-            };
-            let (inputs, mut targets) = if layer.edge.is_some() {
+            let (inputs, mut targets) = if let Some(rows) = &incoming {
+                let summed = Input {
+                    rows,
+                    width,
+                    column: 0,
+                };
                 (
                     vec![summed, own],
                     vec![(&mut to_incoming[..], 0), (&mut to_nodes[..], column)],
@@ -338,28 +347,20 @@ impl Network<'_> {
                 &gradient,
                 &mut targets,
             ));
-            if let (Some((_, graph)), Some(mlp), Some(parts)) =
-                (features.edges, &layer.edge, &parts)
-            {
+            if let Some(edge_pass) = edge_pass {
                 let mut to_receivers = Buffer::zeros(count * width);
-                let mut to_first = Buffer::any(graph.senders.len() * width);
-                let edge_pass = EdgePass {
-                    mlp,
-                    graph,
-                    parts,
-                    team,
-                };
+                let mut to_first = Buffer::any(edges.len());
                 let mut of_edges = edge_pass.backward(
                     &mut tape.edge,
-                    &mut edges,
+                    &edges,
                     &mut to_edges,
                     &to_incoming,
                     &mut to_receivers,
                     &mut to_first,
                 );
                 let of_nodes = pass.project_backward(
-                    mlp,
-                    graph,
+                    edge_pass.mlp,
+                    edge_pass.graph,
                     &nodes,
                     &to_receivers,
                     &to_first,
@@ -786,14 +787,44 @@ impl EdgePass<'_> {
         });
     }
 
-    /// The way back through [`Self::forward`]: `edges` become those before it, `to_edges` the
+    /// Takes from `edges` what [`Self::forward`] has added; its sums at the `nodes` receivers.
+    fn undo(&self, kept: &mut Kept, edges: &mut [f32], nodes: usize) -> Buffer {
+        let &Self {
+            mlp, graph, team, ..
+        } = self;
+        let width = mlp.outputs();
+        let mut incoming = Buffer::zeros(nodes * width);
+        let (lengths, of_nodes) = self.part_lengths();
+        let count = graph.senders.len();
+        let items: Vec<_> = (self.parts.iter())
+            .zip(kept.parts(&lengths, count))
+            .zip(split(edges, &lengths, count))
+            .zip(split(&mut incoming, &of_nodes, nodes))
+            .collect();
+        team.map(items, |(((part, mut kept), edges), incoming)| {
+            let mut messages = Buffer::any(BLOCK * width);
+            for ((first, count), edges) in
+                blocks(part.edges.len()).zip(edges.chunks_mut(BLOCK * width))
+            {
+                let messages = &mut messages[..edges.len()];
+                mlp.outputs_again(kept.normalized(first, count), messages);
+                rows::subtract(edges, messages);
+                let row = part.edges.start + first;
+                let receivers = &graph.receivers[row..row + count];
+                rows::add_at(incoming, width, messages, receivers, part.nodes.start);
+            }
+        });
+        incoming
+    }
+
+    /// The way back through [`Self::forward`] from the `edges` before it: `to_edges` become the
     /// gradients of these; `to_first` becomes that of the first map's outputs, `to_receivers` its
     /// sums at the receivers. The gradients of the parameters, without the node parts of the first
     /// map.
     fn backward(
         &self,
         kept: &mut Kept,
-        edges: &mut [f32],
+        edges: &[f32],
         to_edges: &mut [f32],
         to_incoming: &[f32],
         to_receivers: &mut [f32],
@@ -807,28 +838,24 @@ impl EdgePass<'_> {
         let count = graph.senders.len();
         let items: Vec<_> = (self.parts.iter())
             .zip(kept.parts(&lengths, count))
-            .zip(split(edges, &lengths, count))
             .zip(split(to_edges, &lengths, count))
             .zip(split(to_first, &lengths, count))
             .zip(split(to_receivers, &nodes, graph.offsets.len() - 1))
             .collect();
         total(team, mlp, items, |item| {
-            let (((((part, mut kept), edges), to_edges), to_first), to_receivers) = item;
+            let ((((part, mut kept), to_edges), to_first), to_receivers) = item;
             let mut sum = Buffer::zeros(mlp.parameters());
             let (mut here, mut there) = (Buffer::any(BLOCK * width), Buffer::any(BLOCK * width));
             for (first, count) in blocks(part.edges.len()) {
                 let row = part.edges.start + first;
                 let receivers = &graph.receivers[row..row + count];
                 let range = first * width..(first + count) * width;
-                let (edges, to_edges) = (&mut edges[range.clone()], &mut to_edges[range.clone()]);
+                let to_edges = &mut to_edges[range.clone()];
                 let mut kept = kept.block(first, count);
-                let message = &mut there[..count * width];
-                mlp.outputs_again(kept.normalized, message);
-                rows::subtract(edges, message);
                 here[..count * width].copy_from_slice(to_edges);
                 rows::add_from(&mut here[..count * width], width, to_incoming, receivers);
                 let own = Input {
-                    rows: edges,
+                    rows: &edges[row * width..(row + count) * width],
                     width,
                     column: 2 * width,
                 };
