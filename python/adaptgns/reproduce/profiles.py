@@ -225,6 +225,7 @@ ONE_SEED = tuple(
         one_seed,
         (
             *DECOUPLED_VARIANTS,
+            MIDDLE_NLL,
             BETA_NLL,
             MATCHED_MSE,
             replace(
@@ -349,7 +350,6 @@ PROFILES: dict[ProfileName, Profile] = {
             ADAPTIVE_NLL,
             SHAPED,
             DENSER_MSE,
-            MIDDLE_NLL,
             *ONE_SEED,
             TUNED,
             LONG_TUNED,
