@@ -228,7 +228,7 @@ pub(super) struct KeptPart<'k> {
 /// The same of a block of a part's rows.
 pub(super) struct KeptBlock<'k> {
     hidden: Vec<Held<'k>>,
-    pub normalized: &'k mut [f32],
+    normalized: &'k mut [f32],
     inverse_std: &'k mut [f32],
 }
 
