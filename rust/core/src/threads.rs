@@ -1,4 +1,4 @@
-//! Thread pools that stay alive in forked processes.
+//! Threads that share the work of one call, and stay awake for the next.
 //!
 //! A process that forks (a torch `DataLoader` starting its workers, say) hands its
 //! child a copy of the pool's memory but none of its threads, and perhaps locks that
@@ -8,9 +8,12 @@
 
 use std::cell::{Cell, UnsafeCell};
 use std::collections::BTreeMap;
+use std::marker::PhantomData;
 use std::num::NonZeroUsize;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
@@ -35,15 +38,36 @@ impl Threads {
     }
 }
 
+/// How long helpers stay awake when there is nothing more to do: waking one takes up to 100 µs, and
+/// the next step of a loop, or the next graph, often comes sooner than they would be missed.
+const LINGER: Duration = Duration::from_micros(500);
+
 /// The helpers of one process: one thread fewer than it may run at once, since the
 /// calling thread works too.
 struct Helpers {
     process: u32,
-    count: usize,
     pool: Option<ThreadPool>,
+    /// Of each helper, whether it is awake or about to be.
+    awake: Vec<AtomicBool>,
     /// Whether a [`team`] has them, to whose end they are nobody else's.
     taken: AtomicBool,
+    /// How many of them at most, from the first, are in that team.
+    members: AtomicUsize,
+    /// What there is to do while `open` is not 0.
+    work: UnsafeCell<Option<*const (dyn Fn() + Sync)>>,
+    /// Number of the work that members may begin; 0 for none.
+    open: AtomicUsize,
+    /// Members that may be at work.
+    active: AtomicUsize,
+    /// How much work has come before.
+    count: AtomicUsize,
 }
+
+// SAFETY: `work` is changed only by the thread of the team that has the helpers, while nothing is
+// open and nobody active, and read only by helpers that are active and have found it open.
+unsafe impl Sync for Helpers {}
+// SAFETY: `work` is empty while helpers are sent, and the rest may be.
+unsafe impl Send for Helpers {}
 
 static HELPERS: AtomicPtr<Helpers> = AtomicPtr::new(std::ptr::null_mut());
 
@@ -57,23 +81,7 @@ fn helpers() -> &'static Helpers {
     {
         return helpers;
     }
-    let count = std::thread::available_parallelism().map_or(1, NonZeroUsize::get) - 1;
-    // A pool that cannot be started (a limit on threads) leaves the caller alone.
-    let pool = (count > 0)
-        .then(|| {
-            ThreadPoolBuilder::new()
-                .num_threads(count)
-                .thread_name(|i| format!("adaptgns-{i}"))
-                .build()
-                .ok()
-        })
-        .flatten();
-    let fresh = Box::into_raw(Box::new(Helpers {
-        process,
-        count,
-        pool,
-        taken: AtomicBool::new(false),
-    }));
+    let fresh = Box::into_raw(Box::new(Helpers::new(process)));
     match HELPERS.compare_exchange(current, fresh, Ordering::AcqRel, Ordering::Acquire) {
         // SAFETY: `fresh` was just leaked and is published, so it lives for ever.
         Ok(_) => unsafe { &*fresh },
@@ -85,30 +93,116 @@ fn helpers() -> &'static Helpers {
     }
 }
 
-/// Threads that stay awake from one [`Team::map`] to the next: waking them costs more than a short
-/// one takes.
-pub struct Team {
-    /// What there is to do while `open` is not 0.
-    work: UnsafeCell<Option<*const (dyn Fn() + Sync)>>,
-    /// Number of the work that helpers may begin; 0 for none.
-    open: AtomicUsize,
-    /// Helpers that may be at work.
-    active: AtomicUsize,
-    /// How many have come before.
-    count: Cell<usize>,
-    over: AtomicBool,
-    helped: bool,
+impl Helpers {
+    fn new(process: u32) -> Self {
+        let count = std::thread::available_parallelism().map_or(1, NonZeroUsize::get) - 1;
+        // A pool that cannot be started (a limit on threads) leaves the caller alone.
+        let pool = (count > 0)
+            .then(|| {
+                ThreadPoolBuilder::new()
+                    .num_threads(count)
+                    .thread_name(|i| format!("adaptgns-{i}"))
+                    .build()
+                    .ok()
+            })
+            .flatten();
+        Self {
+            process,
+            pool,
+            awake: (0..count).map(|_| AtomicBool::new(false)).collect(),
+            taken: AtomicBool::new(false),
+            members: AtomicUsize::new(0),
+            work: UnsafeCell::new(None),
+            open: AtomicUsize::new(0),
+            active: AtomicUsize::new(0),
+            count: AtomicUsize::new(0),
+        }
+    }
+
+    /// Wakes the members that sleep, without waiting until they are awake.
+    fn wake(&'static self) {
+        let Some(pool) = &self.pool else { return };
+        let members = self.members.load(Ordering::Relaxed);
+        for (i, awake) in self.awake.iter().enumerate().take(members) {
+            if !awake.load(Ordering::Relaxed) && !awake.swap(true, Ordering::Relaxed) {
+                pool.spawn(move || self.help(i));
+            }
+        }
+    }
+
+    /// Does `work` on the calling thread and on the members that are awake before it ends, which
+    /// share it out themselves. Only for the team that has the helpers.
+    fn all(&'static self, work: &(dyn Fn() + Sync)) {
+        self.wake(); // one may have fallen asleep just when the team began
+        // SAFETY: only the lifetime changes, and nobody uses it after `_closed` below, which is
+        // dropped before `work` ends.
+        let work: *const (dyn Fn() + Sync) =
+            unsafe { std::mem::transmute::<&(dyn Fn() + Sync), &'static (dyn Fn() + Sync)>(work) };
+        // SAFETY: nothing is open and nobody active, so no helper looks.
+        unsafe { *self.work.get() = Some(work) };
+        let number = self.count.fetch_add(1, Ordering::Relaxed) + 1;
+        self.open.store(number, Ordering::SeqCst);
+        let _closed = OnDrop(|| {
+            self.open.store(0, Ordering::SeqCst);
+            while self.active.load(Ordering::SeqCst) > 0 {
+                std::hint::spin_loop();
+            }
+        });
+        // SAFETY: it is alive, see above.
+        unsafe { (*work)() };
+    }
+
+    /// What the helper of this number does until it goes to sleep.
+    fn help(&self, number: usize) {
+        let _asleep = OnDrop(|| self.awake[number].store(false, Ordering::Relaxed));
+        let member = || number < self.members.load(Ordering::SeqCst);
+        let (mut last, mut idle, mut since) = (0, 0_u32, Instant::now());
+        loop {
+            let open = self.open.load(Ordering::SeqCst);
+            if open == 0 || open == last || !member() {
+                idle += 1;
+                if idle.is_multiple_of(1 << 10) {
+                    std::thread::yield_now(); // others may need the core
+                    if member() {
+                        since = Instant::now();
+                    } else if since.elapsed() > LINGER {
+                        return;
+                    }
+                }
+                std::hint::spin_loop();
+                continue;
+            }
+            last = open;
+            self.active.fetch_add(1, Ordering::SeqCst);
+            let _left = OnDrop(|| {
+                self.active.fetch_sub(1, Ordering::Release);
+            });
+            // Open still, so the owner waits until this helper has left.
+            if self.open.load(Ordering::SeqCst) == open {
+                // SAFETY: the owner changes the work, and lets what it points to go, only after it
+                // has closed it and no helper is active.
+                if let Some(work) = unsafe { *self.work.get() } {
+                    // A panic is the owner's to tell, who misses what this was to make.
+                    // SAFETY: as above.
+                    let _ = catch_unwind(AssertUnwindSafe(|| unsafe { (*work)() }));
+                }
+            }
+            since = Instant::now();
+        }
+    }
 }
 
-/// What helpers see of a [`Team`].
-struct Helped<'t>(&'t Team);
-
-// SAFETY: a helper touches `open`, `active`, `over` and, while `open` says so and `active` counts
-// it, `work`, which its owner does not change then; `count` is the owner's.
-unsafe impl Sync for Helped<'_> {}
+/// Threads that stay awake from one [`Team::map`] to the next.
+pub struct Team {
+    /// Where they are, if it has any but the caller's.
+    helpers: Option<&'static Helpers>,
+    /// A team is its thread's.
+    _not_sync: PhantomData<Cell<()>>,
+}
 
 /// What `body` returns, which may share its work with up to `threads` threads; it works alone where
-/// another team has the helpers, since waiting for that would take longer.
+/// another team has the helpers, since waiting for that would take longer. Helpers that slept join
+/// when they are awake.
 pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
     let wanted = match threads {
         Threads::All => usize::MAX,
@@ -116,71 +210,29 @@ pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
     };
     let helpers = (wanted > 1)
         .then(helpers)
-        .and_then(|helpers| Some((helpers, helpers.pool.as_ref()?)))
-        .filter(|(helpers, _)| !helpers.taken.swap(true, Ordering::Relaxed));
-    let team = Team {
-        helped: helpers.is_some(),
+        .filter(|helpers| helpers.pool.is_some())
+        .filter(|helpers| !helpers.taken.swap(true, Ordering::Acquire));
+    let Some(helpers) = helpers else {
+        return body(&Team::alone());
+    };
+    let _given_back = OnDrop(|| {
+        helpers.members.store(0, Ordering::SeqCst);
+        helpers.taken.store(false, Ordering::Release);
+    });
+    helpers.members.store(wanted - 1, Ordering::SeqCst);
+    helpers.wake();
+    body(&Team {
+        helpers: Some(helpers),
         ..Team::alone()
-    };
-    let Some((helpers, pool)) = helpers else {
-        return body(&team);
-    };
-    let _given_back = OnDrop(|| helpers.taken.store(false, Ordering::Relaxed));
-    let helped = Helped(&team);
-    pool.in_place_scope(|scope| {
-        // Also where `body` panics: the scope waits for the helpers.
-        let _over = OnDrop(|| team.over.store(true, Ordering::Release));
-        for _ in 0..helpers.count.min(wanted - 1) {
-            scope.spawn(|_| helped.help());
-        }
-        body(&team)
     })
-}
-
-impl Helped<'_> {
-    fn help(&self) {
-        let team = self.0;
-        let mut last = 0;
-        let mut idle = 0_u32;
-        while !team.over.load(Ordering::Acquire) {
-            let number = team.open.load(Ordering::SeqCst);
-            if number == 0 || number == last {
-                idle += 1;
-                if idle.is_multiple_of(1 << 10) {
-                    std::thread::yield_now(); // others may need the core
-                }
-                std::hint::spin_loop();
-                continue;
-            }
-            idle = 0;
-            last = number;
-            team.active.fetch_add(1, Ordering::SeqCst);
-            let _left = OnDrop(|| {
-                team.active.fetch_sub(1, Ordering::Release);
-            });
-            // Open still, so the owner waits until this helper has left.
-            if team.open.load(Ordering::SeqCst) == number {
-                // SAFETY: the owner changes the work, and lets what it points to go, only after it
-                // has closed it and no helper is active.
-                if let Some(work) = unsafe { *team.work.get() } {
-                    // SAFETY: as above.
-                    unsafe { (*work)() };
-                }
-            }
-        }
-    }
 }
 
 impl Team {
     /// The calling thread.
     pub fn alone() -> Self {
         Self {
-            work: UnsafeCell::new(None),
-            open: AtomicUsize::new(0),
-            active: AtomicUsize::new(0),
-            count: Cell::new(0),
-            over: AtomicBool::new(false),
-            helped: false,
+            helpers: None,
+            _not_sync: PhantomData,
         }
     }
 
@@ -188,25 +240,26 @@ impl Team {
     /// after every task has, so that what these write may be taken as written; should one panic, so
     /// does this.
     pub fn map<I: Send, R: Send>(&self, items: Vec<I>, task: impl Fn(I) -> R + Sync) -> Vec<R> {
-        if !self.helped || items.len() < 2 {
+        let Some(helpers) = self.helpers.filter(|_| items.len() > 1) else {
             return items.into_iter().map(task).collect();
-        }
-        let count = items.len();
-        let finished = Mutex::new(Vec::with_capacity(count));
-        let waiting = Mutex::new(items.into_iter().enumerate());
-        self.all(&|| {
-            let mut mine = Vec::new();
-            loop {
-                let next = lock(&waiting).next();
-                let Some((i, item)) = next else { break };
-                mine.push((i, task(item)));
+        };
+        let next = AtomicUsize::new(0);
+        let places: Vec<Mutex<(Option<I>, Option<R>)>> = items
+            .into_iter()
+            .map(|item| Mutex::new((Some(item), None)))
+            .collect();
+        helpers.all(&|| {
+            while let Some(place) = places.get(next.fetch_add(1, Ordering::Relaxed)) {
+                let item = lock(place).0.take();
+                let result = task(item.expect("each is taken once"));
+                lock(place).1 = Some(result);
             }
-            lock(&finished).append(&mut mine);
         });
-        let mut results = std::mem::take(&mut *lock(&finished));
-        assert_eq!(results.len(), count, "a task panicked on another thread");
-        results.sort_unstable_by_key(|&(i, _)| i);
-        results.into_iter().map(|(_, result)| result).collect()
+        let results = places.into_iter().map(|place| {
+            let (_, result) = place.into_inner().unwrap_or_else(PoisonError::into_inner);
+            result.expect("no task panicked on another thread")
+        });
+        results.collect()
     }
 
     /// All results of [`Self::map`] joined, in the order of the items: a result is joined as soon as
@@ -253,26 +306,6 @@ impl Team {
         let joined = joined.into_inner();
         joined.unwrap_or_else(PoisonError::into_inner).total
     }
-
-    /// Does `work` on every thread of the team, which shares it out itself.
-    fn all(&self, work: &(dyn Fn() + Sync)) {
-        // SAFETY: only the lifetime changes, and nobody uses it after `closed` below, which is
-        // dropped before `work` ends.
-        let work: *const (dyn Fn() + Sync) =
-            unsafe { std::mem::transmute::<&(dyn Fn() + Sync), &'static (dyn Fn() + Sync)>(work) };
-        // SAFETY: nothing is open and nobody active, so no helper looks.
-        unsafe { *self.work.get() = Some(work) };
-        self.count.set(self.count.get() + 1);
-        self.open.store(self.count.get(), Ordering::SeqCst);
-        let _closed = OnDrop(|| {
-            self.open.store(0, Ordering::SeqCst);
-            while self.active.load(Ordering::SeqCst) > 0 {
-                std::hint::spin_loop();
-            }
-        });
-        // SAFETY: it is alive, see above.
-        unsafe { (*work)() };
-    }
 }
 
 /// Calls what it holds when it goes out of scope, also in a panic.
@@ -306,6 +339,29 @@ mod tests {
             });
             assert_eq!(total, (2_000..2_040).collect::<Vec<u64>>());
         }
+    }
+
+    #[test]
+    fn teams_come_and_go() {
+        // Helpers are awake still, fall asleep meanwhile, or are another team's.
+        std::thread::scope(|scope| {
+            for caller in 1..=3_u64 {
+                scope.spawn(move || {
+                    for round in 0..400 {
+                        let members = NonZeroUsize::new(1 + round as usize % 4);
+                        let threads = members.map_or(Threads::All, Threads::AtMost);
+                        let total: u64 = team(threads, |team| {
+                            let squares = team.map((0..50).collect(), |x: u64| x * x + round);
+                            team.reduce(squares, |x| x, |x, y| x + y).expect("some")
+                        });
+                        assert_eq!(total, 40_425 + 50 * round);
+                        if round % 10 == 0 {
+                            std::thread::sleep(LINGER * (caller as u32 - 1));
+                        }
+                    }
+                });
+            }
+        });
     }
 
     #[test]

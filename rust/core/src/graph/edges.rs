@@ -4,7 +4,7 @@ use std::mem::MaybeUninit;
 
 use super::Graph;
 use super::lanes::{LONGEST, Lanes, Work, widest};
-use super::memory::{Budget, Places, reserve, room};
+use super::memory::{Budget, Places, reserve, room, share};
 use super::order::{NONE, SHORT, write_sorted};
 use crate::Error;
 use crate::threads::Team;
@@ -73,8 +73,12 @@ const SOON: usize = 32;
 /// Numbers of a row to a line of the cache.
 const LINE: usize = 16;
 
-/// Receivers whose rows are written as one task.
+/// Most receivers whose rows are written as one task.
 const TASK: usize = 4096;
+
+/// Particles below which one thread goes over all rows: several would wait for each other's memory
+/// longer than that takes.
+const FEW: usize = 1 << 14;
 
 /// Puts `parts`, each the rows of the receivers named, into one edge list over
 /// `particles`, sorted by receiver.
@@ -89,10 +93,12 @@ pub(super) unsafe fn assemble(
     team: &Team,
     budget: &Budget,
 ) -> Result<Graph, Error> {
+    let (task, alone) = (share(particles, TASK), Team::alone());
+    let passing = if particles < FEW { &alone } else { team };
     // The senders of each receiver, and the room behind them.
     let mut rows: Vec<&[i32]> = room(particles);
     let places = Places::of(&mut rows.spare_capacity_mut()[..particles]);
-    team.map(parts, |(receivers, part)| {
+    passing.map(parts, |(receivers, part)| {
         assert_eq!(receivers.len(), part.counts.len());
         let mut senders = &part.senders[..];
         for (&receiver, &count) in receivers.iter().zip(&part.counts) {
@@ -106,7 +112,7 @@ pub(super) unsafe fn assemble(
     unsafe { rows.set_len(particles) };
 
     let kept = |row: &&[i32]| row.len() - ROOM - usize::from(drop_self);
-    let counts = team.map(rows.chunks(TASK).collect(), |rows| {
+    let counts = passing.map(rows.chunks(task).collect(), |rows| {
         rows.iter().map(kept).sum::<usize>()
     });
     let edges = counts.iter().sum();
@@ -117,14 +123,14 @@ pub(super) unsafe fn assemble(
         edge_index.spare_capacity_mut()[..2 * edges].split_at_mut(edges);
     let mut first_edge = 0;
     let tasks = rows
-        .chunks(TASK)
-        .zip(offsets.spare_capacity_mut().chunks_mut(TASK))
+        .chunks(task)
+        .zip(offsets.spare_capacity_mut().chunks_mut(task))
         .zip(counts)
         .enumerate()
         .map(|(t, ((rows, offsets), count))| {
             first_edge += count;
             Writing {
-                first: (t * TASK) as i32,
+                first: (t * task) as i32,
                 first_edge: first_edge - count,
                 rows,
                 offsets,

@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::Graph;
 use super::edges::{self, Rows};
 use super::input::{Batch, Options, Particles, check_length};
-use super::memory::Budget;
+use super::memory::{Budget, share};
 use super::scalar::Scalar;
 use super::search::{Cutoff, Search};
 use crate::Error;
@@ -80,11 +80,8 @@ pub(super) fn within_cutoff<T: Scalar>(
     }
 }
 
-/// Sorted particles searched as one task.
+/// Most sorted particles searched as one task.
 const TASK: usize = 1024;
-
-/// Particles below which waking other threads costs more than it saves.
-const SERIAL: usize = 6 * TASK;
 
 fn build<T: Scalar, const D: usize>(
     batch: &Batch<'_, T, D>,
@@ -92,13 +89,9 @@ fn build<T: Scalar, const D: usize>(
     cutoff: impl FnOnce(&Team) -> Cutoff<T>,
 ) -> Result<Graph, Error> {
     let count = batch.positions.len();
-    let tasks = if count < SERIAL {
-        1
-    } else {
-        count.div_ceil(TASK)
-    };
+    let task = share(count, TASK);
     // The others wake while the particles are sorted.
-    threads::team(options.threads.at_most(tasks), |team| {
+    threads::team(options.threads.at_most(count.div_ceil(task)), |team| {
         let budget = Budget::default();
         let cutoff = &cutoff(team);
         let searches = match &batch.graphs[..] {
@@ -113,8 +106,8 @@ fn build<T: Scalar, const D: usize>(
             .flat_map(|search| {
                 let n = search.index().len();
                 (0..n)
-                    .step_by(TASK)
-                    .map(move |start| (search, start..n.min(start + TASK)))
+                    .step_by(task)
+                    .map(move |start| (search, start..n.min(start + task)))
             })
             .collect();
         let found = team
