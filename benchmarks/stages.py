@@ -38,6 +38,7 @@ from adaptgns.policies import Adaptive, State
 from adaptgns.presets import PRESETS
 from adaptgns.segment import Graph
 from adaptgns.simulator import Simulator
+from adaptgns.threads import divide_threads
 
 WARM_UP = 10
 """Steps at the start of each round that do not count"""
@@ -137,7 +138,7 @@ def watch_all() -> None:
 def use(form: str, threads: int) -> None:
     """The network in the core or in torch."""
     fused.applies = lambda _: form == "core"
-    fused.divide_threads(threads)
+    divide_threads(threads)
     if form == "torch":
         torch.set_num_threads(threads)
 

@@ -37,6 +37,7 @@ from adaptgns.progress import progress_bar
 from adaptgns.rollout import to_sigma
 from adaptgns.segment import Graph
 from adaptgns.snapshot import snapshot
+from adaptgns.threads import thread_count
 from adaptgns.validation import Validation, validate
 from adaptgns.windows import Batch, Windows, training_batches
 
@@ -348,6 +349,7 @@ class Trainer:
             ptr=batch.ptr.numpy(),
             box=self.metadata.box,
             self_edges=self.config.model.self_edges,
+            threads=thread_count(),
             return_offsets=True,
         )
         return Graph.from_numpy(*edges).send(self.device)

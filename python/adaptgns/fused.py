@@ -15,23 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from adaptgns._core import network_backward, network_forward
 from adaptgns.segment import Graph
-
-_threads: int | None = None
-
-
-def divide_threads(count: int) -> None:
-    """From now on, ``count`` threads for the network here and one for torch.
-
-    Torch's threads go on spinning for a while after each of its operations, on the cores that the
-    network's would use; where the network is most of the work, that is slower than doing without.
-    """
-    global _threads  # noqa: PLW0603 (as torch's own number of threads)
-    _threads = count
-    torch.set_num_threads(1)
-
-
-def _thread_count() -> int:
-    return _threads or torch.get_num_threads()
+from adaptgns.threads import thread_count
 
 
 def applies(features: Tensor) -> bool:
@@ -109,7 +93,7 @@ class _Network(torch.autograd.Function):
             heads=heads,
             keep=keep,
             bf16=bf16,
-            threads=_thread_count(),
+            threads=thread_count(),
         )
         ctx.indices, ctx.sizes, ctx.tape = indices, sizes, tape
         ctx.alone, ctx.bf16 = alone, bf16
@@ -129,7 +113,7 @@ class _Network(torch.autograd.Function):
             [_array(gradient) for gradient in gradients],
             alone=ctx.alone,
             bf16=ctx.bf16,
-            threads=_thread_count(),
+            threads=thread_count(),
         )
         parts = torch.split(torch.from_numpy(of_parameters), [p.numel() for p in parameters])
         to_edges = None

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from adaptgns.config import AdaptiveConfig, PolicyName
 from adaptgns.graph import adaptive_graph, knn_graph, radius_graph
 from adaptgns.periodic import minimum_image
+from adaptgns.threads import thread_count
 
 Edges = tuple[NDArray[np.int64], NDArray[np.int64]]
 """``[2, E]`` senders and receivers, and the receivers' row offsets ``[N + 1]``"""
@@ -51,6 +52,7 @@ class State:
             self.radius if radius is None else radius,
             box=self.box,
             self_edges=self.self_edges,
+            threads=thread_count(),
             return_offsets=True,
         )
 
@@ -64,6 +66,7 @@ class State:
             rule.factor,
             box=self.box,
             self_edges=self.self_edges,
+            threads=thread_count(),
             eligible=self.mobile,
             return_offsets=True,
         )
@@ -148,7 +151,9 @@ class Divergence:
 
     def edges(self, state: State) -> Edges:
         positions, (particles, dim) = state.positions, state.positions.shape
-        senders, receivers = radius_graph(positions, state.radius, box=state.box)
+        senders, receivers = radius_graph(
+            positions, state.radius, box=state.box, threads=thread_count()
+        )
         velocity = minimum_image(positions - state.history[:, -2], state.box)
         apart = minimum_image(positions[senders] - positions[receivers], state.box)
         distance = np.maximum(np.square(apart).sum(1), np.finfo(np.float32).tiny)
@@ -200,6 +205,7 @@ class NearestNeighbours:
             self.k,
             box=state.box,
             self_edges=state.self_edges,
+            threads=thread_count(),
             return_offsets=True,
         )
 

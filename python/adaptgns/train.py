@@ -29,11 +29,11 @@ from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.evaluate import evaluate
 from adaptgns.fit import Trainer, TrainingStopped
-from adaptgns.fused import divide_threads
 from adaptgns.plot import animate
 from adaptgns.presets import PRESETS
 from adaptgns.processes import OtherEndedError, Processes, processes
 from adaptgns.rollout import write_rollouts
+from adaptgns.threads import divide_threads
 
 CONFIG = "config.json"
 

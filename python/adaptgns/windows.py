@@ -25,6 +25,7 @@ from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
 from adaptgns.noise import compression, drift_noise, random_walk_noise
 from adaptgns.segment import Graph, Parcel
+from adaptgns.threads import divide_threads, thread_count
 
 Key = tuple[int, int]
 """(epoch, number of the window in the data set)"""
@@ -184,6 +185,7 @@ class Windows(Dataset[Sample]):
                 ptr=ptr,
                 box=self.metadata.box,
                 self_edges=model.self_edges,
+                threads=thread_count(),
                 return_offsets=True,
             )
             graph = Graph.from_numpy(*edges)
@@ -271,10 +273,12 @@ def training_batches(
         num_workers=config.workers,
         collate_fn=windows.collate_share,
         pin_memory=pin,
-        worker_init_fn=_leave_interrupts_to_the_parent,
+        worker_init_fn=_begin_worker,
     )
 
 
-def _leave_interrupts_to_the_parent(_: int) -> None:
-    """Ctrl-C reaches every process of the terminal; the parent saves, and ends its workers."""
+def _begin_worker(_: int) -> None:
+    """A worker is one thread, and leaves Ctrl-C, which reaches every process of the terminal, to
+    its parent, who saves and ends its workers."""
+    divide_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

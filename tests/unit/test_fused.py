@@ -120,7 +120,7 @@ def test_any_number_of_threads_gives_the_same_bits(monkeypatch: pytest.MonkeyPat
     made = Case(nodes=700, edges=4_000)
     results = []
     for threads in (1, 3):
-        monkeypatch.setattr(fused, "_threads", threads)
+        monkeypatch.setattr(fused, "thread_count", lambda threads=threads: threads)
         results.append(made.run())
     for one, three in zip(*results, strict=True):
         assert torch.equal(one, three)

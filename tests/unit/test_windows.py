@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import pickle
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -14,11 +15,13 @@ import numpy as np
 import pytest
 import torch
 
+from adaptgns import threads
 from adaptgns.config import TrainConfig
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.simulator import Simulator
-from adaptgns.windows import Batch, ShuffledKeys, Windows, training_batches
+from adaptgns.threads import thread_count
+from adaptgns.windows import Batch, Sample, ShuffledKeys, Windows, training_batches
 
 
 @pytest.fixture
@@ -128,6 +131,24 @@ def test_number_of_workers_changes_nothing(windows: Windows) -> None:
     assert len(alone) == 5
     for a, b in zip(alone, shared, strict=True):
         assert torch.equal(a, b)
+
+
+class ThreadCounts(Windows):
+    """Instead of batches: how many threads the core may use where they are made."""
+
+    def collate_share(self, samples: Sequence[Sample]) -> int:  # type: ignore[override]
+        return thread_count()
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+def test_a_worker_is_one_thread(
+    drops: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(threads, "_count", 3)
+    windows = ThreadCounts(open_split(drops, "train"), read_metadata(drops), small_config, noise=0)
+    for workers, count in ((0, 3), (1, 1)):
+        config = replace(small_config, workers=workers, steps=2)
+        assert list(training_batches(windows, config, 0, pin=False)) == [count, count]
 
 
 def test_a_batch_reaches_another_process_whole_and_as_bytes(windows: Windows) -> None:

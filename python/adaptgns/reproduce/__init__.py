@@ -25,12 +25,12 @@ from adaptgns.atomic import write_json
 from adaptgns.command import plain_errors
 from adaptgns.config import Device, torch_device
 from adaptgns.fit import Diverged, TrainingStopped
-from adaptgns.fused import divide_threads
 from adaptgns.interruption import interruption
 from adaptgns.reproduce import report
 from adaptgns.reproduce.estimates import seconds
 from adaptgns.reproduce.profiles import PROFILES, ProfileName
 from adaptgns.reproduce.runs import MACHINES, Run, Study, processor, read_machines
+from adaptgns.threads import divide_threads
 
 
 @dataclass(frozen=True)

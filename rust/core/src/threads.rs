@@ -6,7 +6,7 @@
 //! is found through one atomic pointer, carries the id of the process that made it,
 //! and a process with another id makes its own and leaks the old one.
 
-use std::cell::{Cell, UnsafeCell};
+use std::cell::UnsafeCell;
 use std::collections::BTreeMap;
 use std::marker::PhantomData;
 use std::num::NonZeroUsize;
@@ -39,7 +39,7 @@ impl Threads {
 }
 
 /// How long helpers stay awake when there is nothing more to do: waking one takes up to 100 µs, and
-/// the next step of a loop, or the next graph, often comes sooner than they would be missed.
+/// a loop often comes to its next call within this time.
 const LINGER: Duration = Duration::from_micros(500);
 
 /// The helpers of one process: one thread fewer than it may run at once, since the
@@ -66,8 +66,6 @@ struct Helpers {
 // SAFETY: `work` is changed only by the thread of the team that has the helpers, while nothing is
 // open and nobody active, and read only by helpers that are active and have found it open.
 unsafe impl Sync for Helpers {}
-// SAFETY: `work` is empty while helpers are sent, and the rest may be.
-unsafe impl Send for Helpers {}
 
 static HELPERS: AtomicPtr<Helpers> = AtomicPtr::new(std::ptr::null_mut());
 
@@ -124,7 +122,7 @@ impl Helpers {
         let Some(pool) = &self.pool else { return };
         let members = self.members.load(Ordering::Relaxed);
         for (i, awake) in self.awake.iter().enumerate().take(members) {
-            if !awake.load(Ordering::Relaxed) && !awake.swap(true, Ordering::Relaxed) {
+            if !awake.load(Ordering::SeqCst) && !awake.swap(true, Ordering::SeqCst) {
                 pool.spawn(move || self.help(i));
             }
         }
@@ -132,8 +130,7 @@ impl Helpers {
 
     /// Does `work` on the calling thread and on the members that are awake before it ends, which
     /// share it out themselves. Only for the team that has the helpers.
-    fn all(&'static self, work: &(dyn Fn() + Sync)) {
-        self.wake(); // one may have fallen asleep just when the team began
+    fn all(&self, work: &(dyn Fn() + Sync)) {
         // SAFETY: only the lifetime changes, and nobody uses it after `_closed` below, which is
         // dropped before `work` ends.
         let work: *const (dyn Fn() + Sync) =
@@ -144,8 +141,9 @@ impl Helpers {
         self.open.store(number, Ordering::SeqCst);
         let _closed = OnDrop(|| {
             self.open.store(0, Ordering::SeqCst);
+            let mut pauses = 0;
             while self.active.load(Ordering::SeqCst) > 0 {
-                std::hint::spin_loop();
+                pause(&mut pauses);
             }
         });
         // SAFETY: it is alive, see above.
@@ -154,22 +152,22 @@ impl Helpers {
 
     /// What the helper of this number does until it goes to sleep.
     fn help(&self, number: usize) {
-        let _asleep = OnDrop(|| self.awake[number].store(false, Ordering::Relaxed));
         let member = || number < self.members.load(Ordering::SeqCst);
-        let (mut last, mut idle, mut since) = (0, 0_u32, Instant::now());
+        let (mut last, mut pauses, mut since) = (0, 0, Instant::now());
         loop {
             let open = self.open.load(Ordering::SeqCst);
             if open == 0 || open == last || !member() {
-                idle += 1;
-                if idle.is_multiple_of(1 << 10) {
-                    std::thread::yield_now(); // others may need the core
+                if pause(&mut pauses) {
                     if member() {
                         since = Instant::now();
                     } else if since.elapsed() > LINGER {
-                        return;
+                        self.awake[number].store(false, Ordering::SeqCst);
+                        // A team that began just now may have found this helper awake.
+                        if !member() || self.awake[number].swap(true, Ordering::SeqCst) {
+                            return;
+                        }
                     }
                 }
-                std::hint::spin_loop();
                 continue;
             }
             last = open;
@@ -192,12 +190,23 @@ impl Helpers {
     }
 }
 
+/// Waits for a moment; every now and then, which it tells, others may have the core.
+fn pause(pauses: &mut u32) -> bool {
+    std::hint::spin_loop();
+    *pauses = (*pauses + 1) % (1 << 10);
+    let yields = *pauses == 0;
+    if yields {
+        std::thread::yield_now();
+    }
+    yields
+}
+
 /// Threads that stay awake from one [`Team::map`] to the next.
 pub struct Team {
     /// Where they are, if it has any but the caller's.
     helpers: Option<&'static Helpers>,
     /// A team is its thread's.
-    _not_sync: PhantomData<Cell<()>>,
+    _neither_send_nor_sync: PhantomData<*const ()>,
 }
 
 /// What `body` returns, which may share its work with up to `threads` threads; it works alone where
@@ -232,7 +241,7 @@ impl Team {
     pub fn alone() -> Self {
         Self {
             helpers: None,
-            _not_sync: PhantomData,
+            _neither_send_nor_sync: PhantomData,
         }
     }
 
@@ -257,7 +266,7 @@ impl Team {
         });
         let results = places.into_iter().map(|place| {
             let (_, result) = place.into_inner().unwrap_or_else(PoisonError::into_inner);
-            result.expect("no task panicked on another thread")
+            result.unwrap_or_else(|| panic!("a task panicked on another thread"))
         });
         results.collect()
     }
@@ -317,8 +326,7 @@ impl<F: FnMut()> Drop for OnDrop<F> {
     }
 }
 
-/// Locks; what a panicking thread held is as good as ever. Its panic surfaces when the scope ends,
-/// and before that nothing takes what it was to make for made.
+/// Locks; what a panicking thread held is as good as ever, and what it was to make is missed.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -348,20 +356,36 @@ mod tests {
             for caller in 1..=3_u64 {
                 scope.spawn(move || {
                     for round in 0..400 {
-                        let members = NonZeroUsize::new(1 + round as usize % 4);
+                        let members = NonZeroUsize::new(round as usize % 4);
                         let threads = members.map_or(Threads::All, Threads::AtMost);
                         let total: u64 = team(threads, |team| {
                             let squares = team.map((0..50).collect(), |x: u64| x * x + round);
                             team.reduce(squares, |x| x, |x, y| x + y).expect("some")
                         });
                         assert_eq!(total, 40_425 + 50 * round);
-                        if round % 10 == 0 {
+                        if round % 11 == 0 {
                             std::thread::sleep(LINGER * (caller as u32 - 1));
                         }
                     }
                 });
             }
         });
+    }
+
+    #[test]
+    fn no_more_threads_than_allowed_work_even_where_others_are_awake() {
+        for most in [usize::MAX, 3, 2, 1] {
+            let most = NonZeroUsize::new(most).expect("not zero");
+            let mut ids = team(Threads::AtMost(most), |team| {
+                team.map((0..200).collect(), |_: i32| {
+                    std::thread::sleep(Duration::from_micros(10));
+                    std::thread::current().id()
+                })
+            });
+            ids.sort_unstable_by_key(|id| format!("{id:?}"));
+            ids.dedup();
+            assert!(ids.len() <= most.get(), "{ids:?}");
+        }
     }
 
     #[test]

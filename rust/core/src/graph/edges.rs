@@ -4,7 +4,7 @@ use std::mem::MaybeUninit;
 
 use super::Graph;
 use super::lanes::{LONGEST, Lanes, Work, widest};
-use super::memory::{Budget, Places, reserve, room, share};
+use super::memory::{Budget, Places, reserve, room};
 use super::order::{NONE, SHORT, write_sorted};
 use crate::Error;
 use crate::threads::Team;
@@ -80,6 +80,24 @@ const TASK: usize = 4096;
 /// longer than that takes.
 const FEW: usize = 1 << 14;
 
+/// How many of `count` particles, at most `most`, are dealt with as one task. Few tasks are a power
+/// of two, since threads that are as many then end together; and fewer than [`WORTH_SHARING`] are
+/// one.
+pub(super) fn task_size(count: usize, most: usize) -> usize {
+    const FEW_TASKS: usize = 16;
+    let mut tasks = count.div_ceil(most);
+    if tasks < FEW_TASKS {
+        tasks = tasks.next_power_of_two();
+    }
+    if count >= WORTH_SHARING {
+        tasks = tasks.max(2);
+    }
+    count.div_ceil(tasks).max(1)
+}
+
+/// Particles below which several threads wait for each other's memory longer than the rest takes.
+const WORTH_SHARING: usize = 1 << 10;
+
 /// Puts `parts`, each the rows of the receivers named, into one edge list over
 /// `particles`, sorted by receiver.
 ///
@@ -93,7 +111,7 @@ pub(super) unsafe fn assemble(
     team: &Team,
     budget: &Budget,
 ) -> Result<Graph, Error> {
-    let (task, alone) = (share(particles, TASK), Team::alone());
+    let (task, alone) = (task_size(particles, TASK), Team::alone());
     let passing = if particles < FEW { &alone } else { team };
     // The senders of each receiver, and the room behind them.
     let mut rows: Vec<&[i32]> = room(particles);
@@ -199,5 +217,19 @@ fn fill(out: &mut [MaybeUninit<i64>], count: usize, value: i64) {
             Some(out) => *out = [MaybeUninit::new(value); WHOLE],
             None => out[..count - start].fill(MaybeUninit::new(value)),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tasks_are_one_then_a_power_of_two_then_as_large_as_they_may_be() {
+        let sizes = [0, 1, 1_023, 1_024, 1_025, 5_000, 16_000, 1_000_000];
+        assert_eq!(
+            sizes.map(|count| task_size(count, 1_024)),
+            [1, 1, 1_023, 512, 513, 625, 1_000, 1_024]
+        );
     }
 }

@@ -20,16 +20,6 @@ const UNASKED: usize = 1 << 22;
 /// Values that one thread deals with at a time where all are alike.
 pub(super) const SHARE: usize = 1 << 12;
 
-/// How many of `count` particles, at most `most`, one thread deals with at a time: in as many shares
-/// as a power of two, since threads that are as many then end together, and in one where several
-/// threads would wait for each other's memory longer than they take.
-pub(super) fn share(count: usize, most: usize) -> usize {
-    const WORTH_SHARING: usize = 1 << 10;
-    let least = if count < WORTH_SHARING { 1 } else { 2 };
-    let shares = count.div_ceil(most).next_power_of_two().max(least);
-    count.div_ceil(shares).max(1)
-}
-
 /// Counts the edges that all threads have found so far.
 #[derive(Default)]
 pub(super) struct Budget {

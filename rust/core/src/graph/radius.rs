@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::Graph;
 use super::edges::{self, Rows};
 use super::input::{Batch, Options, Particles, check_length};
-use super::memory::{Budget, share};
+use super::memory::Budget;
 use super::scalar::Scalar;
 use super::search::{Cutoff, Search};
 use crate::Error;
@@ -89,7 +89,7 @@ fn build<T: Scalar, const D: usize>(
     cutoff: impl FnOnce(&Team) -> Cutoff<T>,
 ) -> Result<Graph, Error> {
     let count = batch.positions.len();
-    let task = share(count, TASK);
+    let task = edges::task_size(count, TASK);
     // The others wake while the particles are sorted.
     threads::team(options.threads.at_most(count.div_ceil(task)), |team| {
         let budget = Budget::default();

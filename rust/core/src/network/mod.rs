@@ -139,6 +139,13 @@ impl Network<'_> {
             + self.heads.iter().map(Mlp::parameters).sum::<usize>()
     }
 
+    /// `threads`, as far as there are parts for them.
+    fn useful(&self, features: &Features<'_>, threads: Threads) -> Threads {
+        let edges = features.edges.map_or(0, |(_, graph)| graph.senders.len());
+        let parts = part_count(edges, EDGES).max(part_count(self.node_count(features), NODES));
+        threads.at_most(parts)
+    }
+
     /// The heads' outputs `[N, :]` each, and with `keep` what [`Self::backward`] needs. A layer's
     /// copies of its weights go with it.
     pub fn forward(
@@ -148,7 +155,7 @@ impl Network<'_> {
         threads: Threads,
     ) -> Result<(Vec<Vec<f32>>, Option<Tape>), crate::Error> {
         self.check(&features)?;
-        Ok(threads::team(threads, |team| {
+        Ok(threads::team(self.useful(&features, threads), |team| {
             self.pass_forward(features, keep, team)
         }))
     }
@@ -260,7 +267,7 @@ impl Network<'_> {
     ) -> Result<Gradients, crate::Error> {
         self.check(&features)?;
         self.check_tape(&features, tape, heads)?;
-        Ok(threads::team(threads, |team| {
+        Ok(threads::team(self.useful(&features, threads), |team| {
             self.pass_backward(features, tape, heads, alone, team)
         }))
     }
