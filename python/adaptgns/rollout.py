@@ -67,7 +67,8 @@ def steps(
     if policy.needs_sigma and simulator.network.variance_head is None:
         raise ValueError(
             f"policy: got {policy.name}, which needs the model's variance; this model was trained "
-            "with the loss mse, which has none; accepted are fixed and knn"
+            "with the loss mse, which has none; accepted are fixed, knn, acceleration and "
+            "divergence"
         )
     if policy.name != "fixed" and not simulator.config.edges:
         raise ValueError(
