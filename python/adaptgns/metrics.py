@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from adaptgns._core import radius_graph
 from adaptgns.periodic import minimum_image
+from adaptgns.threads import thread_count
 
 Floats = NDArray[np.float32] | NDArray[np.float64]
 
@@ -109,7 +110,7 @@ def _edge_count(
 ) -> float:
     if not np.isfinite(frame).all():
         return np.nan
-    senders, receivers = radius_graph(frame, radius, box=box)
+    senders, receivers = radius_graph(frame, radius, box=box, threads=thread_count())
     return int(np.count_nonzero(mobile[senders] | mobile[receivers]))
 
 

@@ -22,6 +22,7 @@ from adaptgns.graph import radius_graph
 from adaptgns.losses import training_loss
 from adaptgns.reproduce.runs import Run, Split
 from adaptgns.segment import Graph
+from adaptgns.threads import thread_count
 
 REPEATS = 3
 """Of which the fastest counts: what else the machine does is not the run's cost."""
@@ -121,6 +122,7 @@ def _step(
                 positions.astype(np.float32),
                 radius * metadata.radius,
                 self_edges=True,
+                threads=thread_count(),
                 return_offsets=True,
             )
             graph = Graph.from_numpy(*found).to(device)

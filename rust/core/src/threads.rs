@@ -79,7 +79,8 @@ fn helpers() -> &'static Helpers {
     {
         return helpers;
     }
-    let fresh = Box::into_raw(Box::new(Helpers::new(process)));
+    let count = std::thread::available_parallelism().map_or(1, NonZeroUsize::get) - 1;
+    let fresh = Box::into_raw(Box::new(Helpers::new(process, count)));
     match HELPERS.compare_exchange(current, fresh, Ordering::AcqRel, Ordering::Acquire) {
         // SAFETY: `fresh` was just leaked and is published, so it lives for ever.
         Ok(_) => unsafe { &*fresh },
@@ -92,8 +93,7 @@ fn helpers() -> &'static Helpers {
 }
 
 impl Helpers {
-    fn new(process: u32) -> Self {
-        let count = std::thread::available_parallelism().map_or(1, NonZeroUsize::get) - 1;
+    fn new(process: u32, count: usize) -> Self {
         // A pool that cannot be started (a limit on threads) leaves the caller alone.
         let pool = (count > 0)
             .then(|| {
@@ -213,6 +213,14 @@ pub struct Team {
 /// another team has the helpers, since waiting for that would take longer. Helpers that slept join
 /// when they are awake.
 pub fn team<R>(threads: Threads, body: impl FnOnce(&Team) -> R) -> R {
+    team_from(helpers, threads, body)
+}
+
+fn team_from<R>(
+    helpers: impl FnOnce() -> &'static Helpers,
+    threads: Threads,
+    body: impl FnOnce(&Team) -> R,
+) -> R {
     let wanted = match threads {
         Threads::All => usize::MAX,
         Threads::AtMost(limit) => limit.get(),
@@ -333,6 +341,8 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::HashSet;
+
     use super::*;
 
     #[test]
@@ -374,17 +384,24 @@ mod tests {
 
     #[test]
     fn no_more_threads_than_allowed_work_even_where_others_are_awake() {
-        for most in [usize::MAX, 3, 2, 1] {
-            let most = NonZeroUsize::new(most).expect("not zero");
-            let mut ids = team(Threads::AtMost(most), |team| {
-                team.map((0..200).collect(), |_: i32| {
-                    std::thread::sleep(Duration::from_micros(10));
-                    std::thread::current().id()
-                })
-            });
-            ids.sort_unstable_by_key(|id| format!("{id:?}"));
-            ids.dedup();
-            assert!(ids.len() <= most.get(), "{ids:?}");
+        let helpers: &'static Helpers = Box::leak(Box::new(Helpers::new(std::process::id(), 3)));
+        let workers = |threads| {
+            team_from(
+                || helpers,
+                threads,
+                |team| {
+                    let ids = team.map((0..200).collect(), |_: i32| {
+                        std::thread::sleep(Duration::from_micros(100));
+                        std::thread::current().id()
+                    });
+                    ids.into_iter().collect::<HashSet<_>>().len()
+                },
+            )
+        };
+        for most in [4, 3, 2, 1] {
+            let threads = Threads::AtMost(NonZeroUsize::new(most).expect("not zero"));
+            let counts: Vec<usize> = (0..20).map(|_| workers(threads)).collect();
+            assert_eq!(counts.into_iter().max(), Some(most));
         }
     }
 

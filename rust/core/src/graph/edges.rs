@@ -78,11 +78,13 @@ const TASK: usize = 4096;
 
 /// Particles below which one thread goes over all rows: several would wait for each other's memory
 /// longer than that takes.
-const FEW: usize = 1 << 14;
+const PASSED_ALONE: usize = 1 << 14;
+
+/// Particles below which several threads wait for each other's memory longer than the rest takes.
+const WORTH_SHARING: usize = 1 << 10;
 
 /// How many of `count` particles, at most `most`, are dealt with as one task. Few tasks are a power
-/// of two, since threads that are as many then end together; and fewer than [`WORTH_SHARING`] are
-/// one.
+/// of two, since threads that are as many then end together.
 pub(super) fn task_size(count: usize, most: usize) -> usize {
     const FEW_TASKS: usize = 16;
     let mut tasks = count.div_ceil(most);
@@ -94,9 +96,6 @@ pub(super) fn task_size(count: usize, most: usize) -> usize {
     }
     count.div_ceil(tasks).max(1)
 }
-
-/// Particles below which several threads wait for each other's memory longer than the rest takes.
-const WORTH_SHARING: usize = 1 << 10;
 
 /// Puts `parts`, each the rows of the receivers named, into one edge list over
 /// `particles`, sorted by receiver.
@@ -112,7 +111,11 @@ pub(super) unsafe fn assemble(
     budget: &Budget,
 ) -> Result<Graph, Error> {
     let (task, alone) = (task_size(particles, TASK), Team::alone());
-    let passing = if particles < FEW { &alone } else { team };
+    let passing = if particles < PASSED_ALONE {
+        &alone
+    } else {
+        team
+    };
     // The senders of each receiver, and the room behind them.
     let mut rows: Vec<&[i32]> = room(particles);
     let places = Places::of(&mut rows.spare_capacity_mut()[..particles]);
