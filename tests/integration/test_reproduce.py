@@ -23,10 +23,11 @@ from adaptgns.reproduce.profiles import PROFILES, Model, ProfileName
 from adaptgns.reproduce.report import MARKERS, write_into
 from adaptgns.reproduce.results import Estimate, Results, estimate
 from adaptgns.reproduce.runs import DataSet, Run, Study, StudyError, matched_radius
+from adaptgns.reproduce.tables import COMPARISONS
 
 QUIET = Console(quiet=True)
 FIGURES = ("statistics", "graphs", "sigma", "steps", "long", "pareto", "reliability", "clouds")
-TABLES = ("rollouts", "comparisons", "clouds", "sweep", "sweep-400", "along", "calibration")
+TABLES = ("rollouts", "comparisons", "clouds", "sweep", "along", "calibration")
 
 
 @pytest.fixture(scope="module")
@@ -65,16 +66,18 @@ def test_every_table_and_figure_is_there(made: ReproduceConfig) -> None:
             assert any(key.startswith(f"{name}-{data}") for key in found), (name, data)
         questions = [row["cells"][0] for row in found[f"comparisons-{data}"]["rows"]]
         assert "adaptive NLL or fixed MSE: the aim" in questions
-        assert "the chosen rule or fixed MSE, trained so: the aim" in questions
-    assert "long-waterdrop" in found
-    assert "long-sand" not in found
+        aim = "the chosen rule or fixed MSE: the aim, 4 times the training"
+        assert (aim in questions) == (data == "waterdrop"), "trained on water alone"
+    for name in ("long", "sweep-400"):
+        assert f"{name}-waterdrop" in found
+        assert f"{name}-sand" not in found
     report = (folder(made) / "report.md").read_text()
     for name in FIGURES:
         assert f"(figures/{name}.png)" in report
         assert (folder(made) / "figures" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
         assert (folder(made) / "figures" / f"{name}.pdf").read_bytes()[:5] == b"%PDF-"
     page = (folder(made) / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == len(FIGURES) + 4, "and a heat map a sweep"
+    assert page.count("data:image/png;base64,") == len(FIGURES) + 3, "and a heat map a sweep"
     assert page.count("<table>") == len(found)
     assert str(folder(made)) not in report + (folder(made) / "tables.json").read_text()
 
@@ -147,13 +150,21 @@ def test_long_rollouts_go_on_where_the_others_end(made: ReproduceConfig) -> None
 
 
 @pytest.mark.parametrize(
-    ("tuned", "sweep", "budget", "seeds"),
-    [("tuned", "sweep", "mse", (0, 1)), ("tuned-400", "sweep-400", "nll-400", (0,))],
+    ("tuned", "sweep", "budget", "seeds", "sets"),
+    [
+        ("tuned", "sweep", "mse", (0, 1), ("waterdrop", "sand")),
+        ("tuned-400", "sweep-400", "nll-400", (0,), ("waterdrop",)),
+    ],
 )
 def test_the_chosen_rule_is_within_the_budget_and_what_is_reported(
-    made: ReproduceConfig, tuned: str, sweep: str, budget: str, seeds: tuple[int, ...]
+    made: ReproduceConfig,
+    tuned: str,
+    sweep: str,
+    budget: str,
+    seeds: tuple[int, ...],
+    sets: tuple[str, ...],
 ) -> None:
-    for data in ("waterdrop", "sand"):
+    for data in sets:
         metrics = folder(made) / "metrics" / data
         result = json.loads((metrics / sweep / "sweep.json").read_text())
         chosen, edges = result["chosen"], result["settings"]["edges"]
@@ -246,6 +257,21 @@ def test_what_the_package_ships_is_not_trained(
             reproduce(replace(config, only=f"waterdrop/{only}"), QUIET)
 
 
+def test_laptop_goes_on_training_on_water_alone_and_every_comparison_is_of_models_that_exist(
+    tmp_path: Path,
+) -> None:
+    study = study_of(ReproduceConfig(preset="laptop", out=tmp_path / "study"))
+    longest = {run.name for run in study.runs() if run.model.share == 8}
+    assert longest == {f"waterdrop/{name}-800-0" for name in ("mse", "nll", "tuned")}
+    models = [model for profile in PROFILES.values() for model in profile.models]
+    known = {(model.name, policy) for model in models for policy in model.policies}
+    for question, one, other in COMPARISONS:
+        assert {one, other} <= known, question
+    prominent = {model.name for model in study.profile.models if model.prominent}
+    assert {"mse", "decoupled-weight", "nll-400", "nll-800"} <= prominent
+    assert not {"nll-30", "beta-nll", "mse-matched"} & prominent
+
+
 def test_the_package_ships_two_runs_of_laptop(tmp_path: Path) -> None:
     def shipped(study: Study) -> dict[str, Path]:
         found = {run.name: run.shipped for run in study.runs() if run.model.chosen is None}
@@ -320,18 +346,22 @@ def spoil(path: Path, **changes: object) -> None:
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        ("nll-0-fixed.json", {"data_fingerprint": "another"}, "was measured on other data"),
-        ("nll-0-fixed.json", {"marks": [5, 20]}, r"was measured at other steps, \[5, 20\]"),
-        ("sweep/sweep.json", {"settings": {"edges": 1.0, "tau": [80.0]}}, "was made with tau"),
-        ("sweep-400/sweep.json", {"settings": {"edges": 1.0, "steps": 9}}, "was made with steps"),
-        ("../waterdrop/nll-400-0-fixed-long.json", {"data_fingerprint": "x"}, "on other data"),
-        ("../waterdrop/nll-400-0-fixed-long.json", {"marks": [5, 20]}, "measured at other steps"),
+        ("sand/nll-0-fixed.json", {"data_fingerprint": "another"}, "was measured on other data"),
+        ("sand/nll-0-fixed.json", {"marks": [5, 20]}, r"was measured at other steps, \[5, 20\]"),
+        ("sand/sweep/sweep.json", {"settings": {"edges": 1.0, "tau": [80.0]}}, "was made with tau"),
+        (
+            "waterdrop/sweep-400/sweep.json",
+            {"settings": {"edges": 1.0, "steps": 9}},
+            "was made with steps",
+        ),
+        ("waterdrop/nll-400-0-fixed-long.json", {"data_fingerprint": "x"}, "on other data"),
+        ("waterdrop/nll-400-0-fixed-long.json", {"marks": [5, 20]}, "measured at other steps"),
     ],
 )
 def test_what_is_not_of_this_study_is_refused(
     study: ReproduceConfig, name: str, changes: dict, message: str
 ) -> None:
-    spoil(folder(study) / "metrics" / "sand" / name, **changes)
+    spoil(folder(study) / "metrics" / name, **changes)
     with pytest.raises(ValueError, match=message):
         reproduce(study, QUIET)
 
@@ -574,20 +604,20 @@ def test_models_of_the_same_length_differ_in_colour(preset: ProfileName) -> None
 
 def test_only_seeds_of_both_are_compared(made: ReproduceConfig) -> None:
     results = Results(study_of(made))
-    pair = results.pair("sand", ("nll-400", "fixed"), ("nll", "fixed"))
+    pair = results.pair("waterdrop", ("nll-400", "fixed"), ("nll", "fixed"))
     assert pair is not None
     assert [[run.name for run in each.runs] for each in pair] == [
-        ["sand/nll-400-0"],
-        ["sand/nll-0"],
+        ["waterdrop/nll-400-0"],
+        ["waterdrop/nll-0"],
     ]
     assert results.difference(*pair, "mse@10").mean == pytest.approx(
         pair[0].scalar("mse@10").mean()
-        - results.series["sand", "nll", "fixed"].scalar("mse@10")[0].mean()
+        - results.series["waterdrop", "nll", "fixed"].scalar("mse@10")[0].mean()
     )
-    pair = results.pair("sand", ("nll", "adaptive"), ("nll", "fixed"))
+    pair = results.pair("waterdrop", ("nll", "adaptive"), ("nll", "fixed"))
     assert pair is not None
     assert [len(each.runs) for each in pair] == [2, 2]
-    assert results.pair("sand", ("beta-nll", "fixed"), ("nll", "fixed")) is None
+    assert results.pair("waterdrop", ("beta-nll", "fixed"), ("nll", "fixed")) is None
 
 
 def test_every_machine_that_a_study_was_made_on_is_named(study: ReproduceConfig) -> None:

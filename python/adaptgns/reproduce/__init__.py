@@ -38,8 +38,8 @@ class ReproduceConfig:
     """Every table and figure of the paper: runs, their metrics, and a report."""
 
     preset: ProfileName = "laptop"
-    """smoke: everything, tiny; laptop: the main models in 8 to 11 hours on two cores; full: all
-    models, trained until the baseline does not clump; paper: the paper's sizes."""
+    """smoke: everything, tiny; laptop: trained as by default, in some twelve hours on two cores;
+    full: trained until the baseline does not clump; paper: the paper's sizes."""
     data: tuple[str, ...] = ("waterdrop", "sand")
     """Data sets: embedded ones, or folders."""
     out: Path | None = None

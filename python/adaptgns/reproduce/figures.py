@@ -242,8 +242,9 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                     if time["elsewhere"]:
                         continue
                     cost = time["graph_ms"] + time["model_ms"]
-                # Hollow, that models trained for longer stand out beside those of their colour.
+                # Hollow, and the larger the longer they were trained, are those trained for longer.
                 face = "none" if series.model.share > 1 else colour(series)
+                size = 4 + 2 * series.model.share**0.5
                 ax.errorbar(
                     cost,
                     error.mean,
@@ -251,10 +252,15 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                     color=colour(series),
                     marker=MARKERS[series.policy],
                     markerfacecolor=face,
+                    markersize=size,
                     linestyle="none",
                     capsize=2,
                 )
-                models[series.model.title] = {"color": colour(series), "markerfacecolor": face}
+                models[series.model.title] = {
+                    "color": colour(series),
+                    "markerfacecolor": face,
+                    "markersize": size,
+                }
                 policies[series.policy] = {"color": BASELINE, "marker": MARKERS[series.policy]}
             ax.set(title=f"{data.name}: MSE@{mark}, length²", xlabel=unit, yscale="log")
             ax.margins(0.15)
@@ -279,6 +285,7 @@ def _reliability(results: Results, sets: list[DataSet]) -> Figure:
                     color=colour(series),
                     alpha=min(1.0, 0.4 + 0.6 * series.model.share),
                     linestyle="-" if series.model.share == 1 else ":",
+                    linewidth=max(1.0, 0.7 * series.model.share**0.5),
                     marker="o",
                     markersize=2.5,
                     label=series.model.title if seed == 0 else None,

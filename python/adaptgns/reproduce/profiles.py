@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 from adaptgns.atomic import six_digits
 from adaptgns.config import HISTORY, AdaptiveConfig, Loss, PolicyName, TrainConfig
@@ -56,11 +56,19 @@ class Model:
     """Of the profile's training steps"""
     seeds: int | None = None
     """How many of the profile's seeds, from the first; None: all"""
+    sets: tuple[str, ...] | None = None
+    """The embedded data sets that it is trained on; None: all, and any"""
     timed_as: str | None = None
     """Name of the model whose steps take as long, being of the same network"""
     policies: tuple[PolicyName, ...] = ("fixed",)
     chosen: Chosen | None = None
     """Of a model that is another one's training under a rule of its own"""
+
+    @property
+    def prominent(self) -> bool:
+        """Whether it belongs where there is no room for all: trained in full and with all seeds, or
+        for longer."""
+        return self.share > 1 or (self.share == 1 and self.seeds is None)
 
     @property
     def depends(self) -> bool:
@@ -115,31 +123,37 @@ EARLY = tuple(
     )
     for percent in (10, 30)
 )
-LONG_MSE = replace(
-    MSE,
-    name="mse-400",
-    title="GNS, MSE, 400 % of the steps, one seed",
-    share=4.0,
-    seeds=1,
-    timed_as="mse",
-    policies=("fixed", "divergence"),
-)
-LONG_NLL = replace(
-    NLL,
-    name="nll-400",
-    title="GNS, NLL, 400 % of the steps, one seed",
-    share=4.0,
-    seeds=1,
-    timed_as="nll",
-)
-LONG_TUNED = replace(
-    TUNED,
-    name="tuned-400",
-    title="AdaptGNS, chosen rule, 400 % of the steps, one seed",
-    share=4.0,
-    seeds=1,
-    chosen=Chosen(weights="nll-400", budget="nll-400", folder="sweep-400"),
-)
+
+
+def longer(percent: int, budget: Model) -> tuple[Model, Model, Model]:
+    """MSE, NLL and the chosen rule, trained for so many percent of the steps with the first seed;
+    the rule may have as many edges as the fixed graph of ``budget``, trained as long."""
+
+    def of(model: Model, **settings: Any) -> Model:
+        return replace(
+            model,
+            name=f"{model.name}-{percent}",
+            title=f"{model.title}, {percent} % of the steps, one seed",
+            share=percent / 100,
+            seeds=1,
+            **settings,
+        )
+
+    chosen = Chosen(f"{NLL.name}-{percent}", f"{budget.name}-{percent}", f"sweep-{percent}")
+    return (
+        of(MSE, timed_as=MSE.name, policies=("fixed", "divergence")),
+        of(NLL, timed_as=NLL.name),
+        of(TUNED, chosen=chosen),
+    )
+
+
+def on_water(models: Iterable[Model]) -> tuple[Model, ...]:
+    """``models``, on that set alone."""
+    return tuple(replace(model, sets=("waterdrop",)) for model in models)
+
+
+LONG = LONG_MSE, LONG_NLL, LONG_TUNED = longer(400, budget=NLL)  # which has fewer edges than MSE
+LONGEST = on_water(longer(800, budget=MSE))
 ADAPTIVE_NLL = replace(
     NLL,
     name="nll-adaptive",
@@ -293,6 +307,10 @@ class Profile:
         """Those that ``model`` is trained with."""
         return self.seeds[: model.seeds]
 
+    def models_on(self, data: str) -> tuple[Model, ...]:
+        """Those that are trained on the data set of that source."""
+        return tuple(each for each in self.models if each.sets is None or data in each.sets)
+
     def model(self, name: str) -> Model:
         """The one of that name."""
         return next(model for model in self.models if model.name == name)
@@ -310,11 +328,9 @@ PROFILES: dict[ProfileName, Profile] = {
             NLL,
             MLP,
             EARLY[1],
-            LONG_NLL,
-            LONG_MSE,
             DECOUPLED,
             TUNED,
-            LONG_TUNED,
+            *on_water(LONG),
         ),
         sweep=Sweep(tau=(70.0,), factor=(1.1, 1.267), radius=(0.9, 1.0)),
         seeds=(0, 1),
@@ -347,6 +363,7 @@ PROFILES: dict[ProfileName, Profile] = {
             *EARLY,
             LONG_NLL,
             LONG_MSE,
+            *LONGEST,
             ADAPTIVE_NLL,
             SHAPED,
             DENSER_MSE,

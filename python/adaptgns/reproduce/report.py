@@ -62,13 +62,13 @@ def write(study: Study) -> list[Path]:
 
 def write_into(study: Study, readme: Path) -> None:
     """Replace what lies between the two marks in ``readme`` by the tables of the rollouts, of the
-    models that were trained in full, without the policies that are there to explain others."""
+    prominent models, without the policies that are there to explain others."""
     text = readme.read_text("utf-8")
     start, end = (text.find(marker) for marker in MARKERS)
     if start < 0 or end < start:
         raise ValueError(f"{readme}: holds no {MARKERS[0]} followed by {MARKERS[1]}")
     parts = [_made(study)]
-    partial = {model.title for model in study.profile.models if model.share < 1}
+    left_out = {model.title for model in study.profile.models if not model.prominent}
     for table in tables(Results(study)):
         if table.name.startswith("rollouts"):
             kept = [
@@ -80,7 +80,7 @@ def write_into(study: Study, readme: Path) -> None:
             rows = [
                 Row([row.cells[i] for i in kept])
                 for row in table.rows
-                if row.cells[0] not in partial and row.cells[1] not in EXPLAINING
+                if row.cells[0] not in left_out and row.cells[1] not in EXPLAINING
             ]
             short = Table(table.name, table.title, [table.columns[i] for i in kept], rows)
             parts.append(f"**{table.title}**\n\n{_table(short)}")
@@ -105,7 +105,7 @@ def _markdown(study: Study, made: list[Table], images: list[Path]) -> str:
             parts.append(table.note)
     parts.append("## Figures")
     for data in study.sets.values():
-        for model in study.profile.models:
+        for model in study.profile.models_on(data.source):
             if model.chosen is None:
                 continue
             folder = data.metrics / model.chosen.folder

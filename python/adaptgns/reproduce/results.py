@@ -137,7 +137,7 @@ class Results:
         return {
             (data.name, model.name, policy): self._series(data, model, policy)
             for data in self.study.sets.values()
-            for model in self.study.profile.models
+            for model in self.study.profile.models_on(data.source)
             for policy in model.policies
         }
 

@@ -9,8 +9,7 @@ policies, and measures that. Files in the study's folder:
 - ``metrics/DATA/MODEL-SEED-POLICY-long.json``: the same of long rollouts, and ``long.json``: what
   their trajectories are like
 - ``metrics/DATA/data.json``: what the data are like; ``gate.json``: how long it had to be trained;
-  ``sweep/``, ``sweep-400/``: the rules that were tried on validation; ``times.json``: milliseconds
-  of a step
+  ``sweep*/``: the rules that were tried on validation; ``times.json``: milliseconds of a step
 - ``data/``: data sets that are generated for a profile
 
 What comes with the package already, of the same configuration and data, is not trained again.
@@ -127,7 +126,7 @@ class Study:
         for depends in (False, True):
             for seed in self.profile.seeds:
                 for data in self.sets.values():
-                    for model in self.profile.models:
+                    for model in self.profile.models_on(data.source):
                         if model.depends == depends and seed in self.profile.seeds_of(model):
                             yield Run(data, model, seed)
 

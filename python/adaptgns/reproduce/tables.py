@@ -43,53 +43,36 @@ ELSEWHERE = "†"
 """Stands at what another processor took"""
 
 Comparison = tuple[str, tuple[str, PolicyName], tuple[str, PolicyName]]
+
+
+def _longer(percent: int) -> tuple[Comparison, ...]:
+    """Those among models that are trained for so many percent of the steps."""
+    mse, nll, tuned = (f"{name}-{percent}" for name in ("mse", "nll", "tuned"))
+    questions: tuple[Comparison, ...] = (
+        ("adaptive or fixed", (nll, "adaptive"), (nll, "fixed")),
+        ("uncertain or random", (nll, "adaptive"), (nll, "random")),
+        ("two-sided or fixed", (nll, "two-sided"), (nll, "fixed")),
+        ("sigma or the divergence around", (nll, "adaptive"), (nll, "divergence")),
+        ("the divergence around or fixed", (nll, "divergence"), (nll, "fixed")),
+        ("adaptive NLL or fixed MSE: the aim", (nll, "adaptive"), (mse, "fixed")),
+        ("the chosen rule or fixed MSE: the aim", (tuned, "adaptive"), (mse, "fixed")),
+        ("the chosen rule or fixed, same model", (tuned, "adaptive"), (nll, "fixed")),
+        ("the chosen rule, uncertain or random", (tuned, "adaptive"), (tuned, "random")),
+        ("two-sided NLL or fixed MSE: the aim", (nll, "two-sided"), (mse, "fixed")),
+        ("NLL or MSE, fixed graphs", (nll, "fixed"), (mse, "fixed")),
+        ("the divergence around or fixed, MSE", (mse, "divergence"), (mse, "fixed")),
+    )
+    return tuple(
+        (f"{question}, {percent // 100} times the training", one, other)
+        for question, one, other in questions
+    )
+
+
 COMPARISONS: tuple[Comparison, ...] = (
     ("adaptive or fixed graph, same model", ("nll", "adaptive"), ("nll", "fixed")),
     ("uncertain or random particles expanded", ("nll", "adaptive"), ("nll", "random")),
-    (
-        "adaptive or fixed, trained four times as long",
-        ("nll-400", "adaptive"),
-        ("nll-400", "fixed"),
-    ),
-    ("uncertain or random, trained so", ("nll-400", "adaptive"), ("nll-400", "random")),
-    ("two-sided or fixed, trained so", ("nll-400", "two-sided"), ("nll-400", "fixed")),
-    (
-        "sigma or the divergence around, trained so",
-        ("nll-400", "adaptive"),
-        ("nll-400", "divergence"),
-    ),
-    ("the divergence around or fixed, trained so", ("nll-400", "divergence"), ("nll-400", "fixed")),
-    (
-        "adaptive NLL or fixed MSE, trained so: the aim",
-        ("nll-400", "adaptive"),
-        ("mse-400", "fixed"),
-    ),
-    (
-        "the chosen rule or fixed MSE, trained so: the aim",
-        ("tuned-400", "adaptive"),
-        ("mse-400", "fixed"),
-    ),
-    (
-        "the chosen rule or fixed, same model, trained so",
-        ("tuned-400", "adaptive"),
-        ("nll-400", "fixed"),
-    ),
-    (
-        "the chosen rule, uncertain or random, trained so",
-        ("tuned-400", "adaptive"),
-        ("tuned-400", "random"),
-    ),
-    (
-        "two-sided NLL or fixed MSE, trained so: the aim",
-        ("nll-400", "two-sided"),
-        ("mse-400", "fixed"),
-    ),
-    ("NLL or MSE, fixed graphs, trained so", ("nll-400", "fixed"), ("mse-400", "fixed")),
-    (
-        "the divergence around or fixed, MSE trained so",
-        ("mse-400", "divergence"),
-        ("mse-400", "fixed"),
-    ),
+    *_longer(400),
+    *_longer(800),
     ("sigma of the step before or of this one", ("nll", "adaptive"), ("nll", "two-pass")),
     ("adaptive NLL or fixed MSE: the aim", ("nll", "adaptive"), ("mse", "fixed")),
     ("the chosen rule or fixed MSE: the aim", ("tuned", "adaptive"), ("mse", "fixed")),
@@ -505,7 +488,7 @@ def _long(results: Results, data: DataSet) -> Table:
 def _sweeps(results: Results, data: DataSet) -> list[Table]:
     return [
         _sweep(results, data, model, model.chosen)
-        for model in results.study.profile.models
+        for model in results.study.profile.models_on(data.source)
         if model.chosen is not None
     ]
 
