@@ -233,7 +233,7 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
     for panels, data in zip(rows, sets, strict=True):
         for ax, unit in zip(panels, ("directed edges a step", "milliseconds a step"), strict=True):
             for series in results.of(data.name):
-                if not series.model.edges or series.model.share < 1:
+                if not series.model.edges or not series.model.prominent:
                     continue
                 error = series.estimate(f"mse@{mark}")
                 cost = series.scalar("edges_per_step").mean()
