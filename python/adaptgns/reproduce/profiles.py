@@ -229,8 +229,8 @@ PAPER_MODELS = (
 
 
 def one_seed(model: Model) -> Model:
-    """``model`` with the first seed alone, its graphs fixed and, if it has sigma, adaptive."""
-    policies = tuple(policy for policy in model.policies if policy in ("fixed", "adaptive"))
+    """``model`` with the first seed alone, and without two-sided graphs."""
+    policies = tuple(policy for policy in model.policies if policy != "two-sided")
     return replace(model, title=f"{model.title}, one seed", seeds=1, policies=policies)
 
 

@@ -174,9 +174,19 @@ COMPARISONS: tuple[Comparison, ...] = (
         ("decoupled-deep", "fixed"),
     ),
     (
+        "uncertain or random, decoupled, deeper head",
+        ("decoupled-deep", "adaptive"),
+        ("decoupled-deep", "random"),
+    ),
+    (
         "adaptive or fixed, sigma of the next step",
         ("decoupled-ahead", "adaptive"),
         ("decoupled-ahead", "fixed"),
+    ),
+    (
+        "uncertain or random, sigma of the next step",
+        ("decoupled-ahead", "adaptive"),
+        ("decoupled-ahead", "random"),
     ),
     (
         "sigma of the next step or of this one",
@@ -185,6 +195,7 @@ COMPARISONS: tuple[Comparison, ...] = (
     ),
     ("adaptive beta-NLL or fixed MSE", ("beta-nll", "adaptive"), ("mse", "fixed")),
     ("adaptive or fixed, beta-NLL", ("beta-nll", "adaptive"), ("beta-nll", "fixed")),
+    ("uncertain or random, beta-NLL", ("beta-nll", "adaptive"), ("beta-nll", "random")),
 )
 
 
