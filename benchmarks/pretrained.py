@@ -2,8 +2,8 @@
 
     python benchmarks/pretrained.py results/laptop
 
-Of each data set's NLL models that were trained longest the one with the lowest validation error,
-with nothing in it of where it was made. Their metrics are those of the study:
+Of each data set's NLL models that were trained four times as long, the one with the lowest
+validation error, with nothing in it of where it was made. Their metrics are those of the study:
 ``metrics/DATA/nll-400-SEED-*.json``.
 """
 
