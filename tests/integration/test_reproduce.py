@@ -268,7 +268,7 @@ def test_laptop_goes_on_training_on_water_alone_and_every_comparison_is_of_model
     for question, one, other in COMPARISONS:
         assert {one, other} <= known, question
     prominent = {model.name for model in study.profile.models if model.prominent}
-    assert {"mse", "decoupled-weight", "nll-400", "nll-800"} <= prominent
+    assert {"mse", "nll-adaptive", "nll-400", "nll-800"} <= prominent
     assert not {"nll-30", "beta-nll", "mse-matched"} & prominent
 
 
@@ -508,18 +508,18 @@ def test_the_matched_radius_is_on_a_line_in_its_square(
 
     monkeypatch.setattr("adaptgns.reproduce.runs.valid_edges", valid_edges)
     sand = study_of(ReproduceConfig(preset="laptop")).sets["sand"]
-    radius = matched_radius(sand, "decoupled-weight", 0, 0.02)
+    radius = matched_radius(sand, "decoupled-weight", 0.02)
     assert (radius / 0.02) ** 2 == pytest.approx(1 + share * ((0.019 / 0.015) ** 2 - 1), rel=1e-4)
     for far in (5.0, 400.0):
         found["decoupled-weight", "adaptive"] = far
         with pytest.raises(StudyError, match=f"sand: no radius matches the {far:.0f} edges of"):
-            matched_radius(sand, "decoupled-weight", 0, 0.02)
+            matched_radius(sand, "decoupled-weight", 0.02)
     found["mse-denser", "fixed"] = 90.0
     with pytest.raises(StudyError, match="fixed graphs have 100 at "):
-        matched_radius(sand, "decoupled-weight", 0, 0.02)
+        matched_radius(sand, "decoupled-weight", 0.02)
     smoke = study_of(ReproduceConfig(preset="smoke")).sets["sand"]
     with pytest.raises(StudyError, match="no model with the denser graph"):
-        matched_radius(smoke, "nll", 0, 0.02)
+        matched_radius(smoke, "nll", 0.02)
 
 
 def test_several_at_a_time(made: ReproduceConfig, tmp_path: Path) -> None:

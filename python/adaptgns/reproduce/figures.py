@@ -229,45 +229,51 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
     mark = results.study.last_mark
     figure, rows = _panels(2, 2.6 * len(sets), len(sets))
     models: dict[str, dict[str, Any]] = {}
+    trainings: dict[str, dict[str, Any]] = {}
     policies: dict[str, dict[str, Any]] = {}
     for panels, data in zip(rows, sets, strict=True):
         for ax, unit in zip(panels, ("directed edges a step", "milliseconds a step"), strict=True):
+            means = []
             for series in results.of(data.name):
-                if not series.model.edges or not series.model.prominent:
+                model = series.model
+                if not model.edges or not model.prominent:
                     continue
                 error = series.estimate(f"mse@{mark}")
                 cost = series.scalar("edges_per_step").mean()
                 if unit.startswith("milli"):
-                    time = data.step_time(series.model, series.policy)
+                    time = data.step_time(model, series.policy)
                     if time["elsewhere"]:
                         continue
                     cost = time["graph_ms"] + time["model_ms"]
+                means.append((cost, error.mean))
+                tint = colour(series)
                 # Hollow, and the larger the longer they were trained, are those trained for longer.
-                face = "none" if series.model.share > 1 else colour(series)
-                size = 4 + 2 * series.model.share**0.5
-                ax.errorbar(
-                    cost,
-                    error.mean,
-                    yerr=[[error.mean - error.low], [error.high - error.mean]],
-                    color=colour(series),
-                    marker=MARKERS[series.policy],
-                    markerfacecolor=face,
-                    markersize=size,
-                    linestyle="none",
-                    capsize=2,
-                )
-                models[series.model.title] = {
-                    "color": colour(series),
-                    "markerfacecolor": face,
-                    "markersize": size,
+                trained = {
+                    "markerfacecolor": "none" if model.share > 1 else tint,
+                    "markersize": 4 + 2 * model.share**0.5,
                 }
+                ax.plot(cost, error.mean, MARKERS[series.policy], color=tint, zorder=3, **trained)
+                ax.vlines(cost, error.low, error.high, color=tint, lw=0.6, alpha=0.4)
+                plain = model
+                if model.share > 1:
+                    plain = results.study.profile.model(model.name.rsplit("-", maxsplit=1)[0])
+                    label = f"{100 * model.share:.0f} % of the steps, one seed"
+                    trainings[label] = {"color": BASELINE, **trained}
+                models[plain.title] = {"color": tint}
                 policies[series.policy] = {"color": BASELINE, "marker": MARKERS[series.policy]}
+            front = np.array([p for p in means if not any(_dominates(q, p) for q in means)])
+            ax.step(*front[front[:, 0].argsort()].T, where="post", color=BASELINE, lw=1.2)
             ax.set(title=f"{data.name}: MSE@{mark}, length²", xlabel=unit, yscale="log")
             ax.margins(0.15)
-    for label, style in (models | policies).items():
+    for label, style in (models | policies | trainings).items():
         rows[0][0].plot([], [], linestyle="none", label=label, **{"marker": "o", **style})
     figures.legend(figure, rows[0][0])
     return figure
+
+
+def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether ``one`` has no more cost and no more error than ``other``, and less of either."""
+    return one != other and one[0] <= other[0] and one[1] <= other[1]
 
 
 def _reliability(results: Results, sets: list[DataSet]) -> Figure:

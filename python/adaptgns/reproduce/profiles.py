@@ -44,8 +44,8 @@ class Model:
     edges: bool = True
     radius: float | Literal["matched"] = 1.0
     """Times the radius of the data; matched: that whose graph has as many edges as the adaptive one
-    of the model ``matches`` in rollouts of the validation split, by a line in the radius's
-    square."""
+    of the model ``matches`` in rollouts of the validation split with the first seed, by a line in
+    the radius's square."""
     matches: str = "nll"
     """Name of the model that a matched radius is matched to"""
     graph: Literal["base", "adaptive", "two-sided"] = "base"
@@ -66,9 +66,8 @@ class Model:
 
     @property
     def prominent(self) -> bool:
-        """Whether it belongs where there is no room for all: trained in full and with all seeds, or
-        for longer."""
-        return self.share > 1 or (self.share == 1 and self.seeds is None)
+        """Whether it belongs where there is no room for all."""
+        return self.name in PROMINENT
 
     @property
     def depends(self) -> bool:
@@ -210,6 +209,12 @@ BETA_NLL = replace(
     loss="beta-nll",
     policies=("fixed", "adaptive", "random"),
 )
+MATCHED_DECOUPLED = replace(
+    MATCHED_MSE,
+    name="mse-matched-decoupled",
+    title="GNS, MSE, r matched to decoupled's edges",
+    matches=SHAPED.name,
+)
 PAPER_MODELS = (
     replace(MSE, policies=(*MSE.policies, *PRIORS)),
     NLL,
@@ -227,6 +232,8 @@ PAPER_MODELS = (
     TUNED,
 )
 
+PROMINENT = {model.name for model in (MSE, NLL, MLP, ADAPTIVE_NLL, TUNED, *LONG, *LONGEST)}
+
 
 def one_seed(model: Model) -> Model:
     """``model`` with the first seed alone, and without two-sided graphs."""
@@ -234,23 +241,7 @@ def one_seed(model: Model) -> Model:
     return replace(model, title=f"{model.title}, one seed", seeds=1, policies=policies)
 
 
-ONE_SEED = tuple(
-    map(
-        one_seed,
-        (
-            *DECOUPLED_VARIANTS,
-            MIDDLE_NLL,
-            BETA_NLL,
-            MATCHED_MSE,
-            replace(
-                MATCHED_MSE,
-                name="mse-matched-decoupled",
-                title="GNS, MSE, r matched to decoupled's edges",
-                matches=SHAPED.name,
-            ),
-        ),
-    )
-)
+ONE_SEED = tuple(map(one_seed, DECOUPLED_VARIANTS))
 
 
 @dataclass(frozen=True)
@@ -367,6 +358,10 @@ PROFILES: dict[ProfileName, Profile] = {
             ADAPTIVE_NLL,
             SHAPED,
             DENSER_MSE,
+            MIDDLE_NLL,
+            MATCHED_MSE,
+            MATCHED_DECOUPLED,
+            BETA_NLL,
             *ONE_SEED,
             TUNED,
             LONG_TUNED,

@@ -499,7 +499,7 @@ class Run:
         radius = float(self.data.described["radius"])
         config = self._config(radius)
         if self.model.radius == "matched":
-            matched = matched_radius(self.data, self.model.matches, self.seed, radius)
+            matched = matched_radius(self.data, self.model.matches, radius)
             config = replace(config, model=replace(config.model, radius=matched))
         return config
 
@@ -683,11 +683,12 @@ def timed_name(model: Model, policy: PolicyName) -> str:
     return f"{model.timed_as or model.name}, {policy}"
 
 
-def matched_radius(data: DataSet, name: str, seed: int, radius: float) -> float:
+def matched_radius(data: DataSet, name: str, radius: float) -> float:
     """The radius of the fixed graph that has as many edges as the adaptive one of the model
-    ``name`` in rollouts of the validation split, by a line in the radius squared through two
-    models' rollouts. StudyError where that is far from both."""
+    ``name`` in rollouts of the validation split with the first seed, by a line in the radius
+    squared through two models' rollouts. StudyError where that is far from both."""
     profile = data.study.profile
+    seed = profile.seeds[0]
     denser = next((m for m in profile.models if m.radius == DENSER), None)
     if denser is None:
         raise StudyError("matched radius: the profile has no model with the denser graph")
