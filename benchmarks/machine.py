@@ -8,16 +8,13 @@ from pathlib import Path
 
 import torch
 
+from adaptgns.reproduce.runs import processor
+
 
 def machine() -> dict[str, object]:
     """Processor, threads, versions, and how busy it was."""
-    model = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        lines = [line for line in info.read_text().splitlines() if line.startswith("model name")]
-        model = lines[0].split(":", 1)[1].strip() if lines else model
     return {
-        "processor": model,
+        "processor": processor(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
