@@ -23,7 +23,15 @@ TYPE_EMBEDDING = 16
 Loss = Literal["nll", "beta-nll", "decoupled", "mse"]
 Preset = Literal["smoke", "laptop", "paper"]
 PolicyName = Literal[
-    "fixed", "adaptive", "two-sided", "two-pass", "random", "acceleration", "divergence", "knn"
+    "fixed",
+    "adaptive",
+    "two-sided",
+    "two-pass",
+    "base-sigma",
+    "random",
+    "acceleration",
+    "divergence",
+    "knn",
 ]
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["float32", "bf16"]
@@ -136,8 +144,9 @@ class RolloutConfig:
     """Which part of the data."""
     policy: PolicyName = "fixed"
     """Graph of each step: fixed radius; adaptive (sigma of the step before), two-sided (and shorter
-    edges where it is low), two-pass (sigma of this step); the same share of particles chosen at
-    random, by the acceleration before, or by the divergence of the velocities around; knn."""
+    edges where it is low), two-pass (sigma of this step), base-sigma (of the step before, but that
+    of fixed graphs); the same share of particles chosen at random, by the acceleration before, or
+    by the divergence of the velocities around; knn."""
     adaptive: AdaptiveConfig = field(default_factory=AdaptiveConfig)
     k: int = 6
     """Neighbours of the policy knn."""

@@ -176,6 +176,24 @@ class TwoPass:
         return state.expanded(state.predict_sigma(state.base()), self.rule)
 
 
+@dataclass
+class BaseSigma:
+    """The particles that were most uncertain one step ago with the base graph see farther, at the
+    price of a second forward pass: :class:`Adaptive` without what longer edges do to the sigma that
+    the next ones are chosen by."""
+
+    name: ClassVar[PolicyName] = "base-sigma"
+    needs_sigma: ClassVar[bool] = True
+    rule: AdaptiveConfig
+    before: NDArray[np.float32] | None = None
+    """``[N]``, sigma of the step before; None before the first"""
+
+    def edges(self, state: State) -> Edges:
+        base = state.base()
+        sigma, self.before = self.before, state.predict_sigma(base)
+        return base if sigma is None else state.expanded(sigma, self.rule)
+
+
 @dataclass(frozen=True)
 class Random:
     """As many particles as in :class:`Adaptive` see farther, drawn at every step: the control."""
@@ -225,7 +243,7 @@ def two_sided(
 
 def make_policy(name: PolicyName, rule: AdaptiveConfig, *, k: int, seed: int) -> Policy:
     """The policy called ``name``; ``seed`` matters for ``random`` alone, ``k`` for ``knn``."""
-    ruled = (Adaptive, TwoSided, TwoPass, Acceleration, Divergence)
+    ruled = (Adaptive, TwoSided, TwoPass, BaseSigma, Acceleration, Divergence)
     for policy in ruled:
         if policy.name == name:
             return policy(rule)

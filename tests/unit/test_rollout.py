@@ -31,7 +31,7 @@ from adaptgns.data.errors import DataError
 from adaptgns.data.metadata import Metadata, read_metadata, write_metadata
 from adaptgns.data.trajectories import Trajectory, open_split
 from adaptgns.policies import Adaptive, Edges, Fixed, State, make_policy
-from adaptgns.rollout import main, steps, write_rollouts
+from adaptgns.rollout import directed_edges, main, steps, write_rollouts
 from adaptgns.simulator import Simulator
 
 RULE = AdaptiveConfig(tau=70, factor=1.5)
@@ -85,6 +85,28 @@ def test_two_pass_expands_at_once(simulator: Simulator, trajectory: Trajectory) 
     (fixed,) = steps(simulator, trajectory, Fixed(), 1)
     (both,) = steps(simulator, trajectory, two_pass, 1)
     assert both.edges > fixed.edges
+
+
+def test_base_sigma_is_that_of_the_fixed_graph_one_step_ago(
+    simulator: Simulator, trajectory: Trajectory
+) -> None:
+    fixed = list(steps(simulator, trajectory, Fixed(), 4, teacher_forcing=True))
+    policy = make_policy("base-sigma", RULE, k=0, seed=0)
+    states: list[State] = []
+
+    class Spy:
+        name, needs_sigma = policy.name, policy.needs_sigma
+
+        def edges(self, state: State) -> Edges:
+            states.append(state)
+            return policy.edges(state)
+
+    made = list(steps(simulator, trajectory, Spy(), 4, teacher_forcing=True))
+    assert made[0].edges == fixed[0].edges
+    for before, state, step in zip(fixed, states[1:], made[1:], strict=False):
+        assert before.sigma is not None
+        expected = state.expanded(before.sigma, RULE)
+        assert step.edges == directed_edges(expected, state.self_edges) > state.base()[0].shape[1]
 
 
 def test_random_is_seeded(simulator: Simulator, trajectory: Trajectory) -> None:
@@ -168,7 +190,10 @@ def test_physical_priors_expand_what_moves_most(name: PolicyName) -> None:
     assert not policy.needs_sigma
 
 
-@pytest.mark.parametrize("name", ["adaptive", "two-pass", "random", "acceleration", "divergence"])
+@pytest.mark.parametrize(
+    "name",
+    ["adaptive", "two-pass", "base-sigma", "random", "acceleration", "divergence"],
+)
 def test_every_policy_without_expansion_is_fixed(
     simulator: Simulator, trajectory: Trajectory, name: PolicyName
 ) -> None:

@@ -46,7 +46,7 @@ def seconds(run: Run) -> float:
         training = model.share * run.data.steps * a_step
     one, _ = _step(base, model.edges, model.loss, test, factor)
     passes = sum(
-        (2 if policy == "two-pass" else 1) * _rollout_steps(run, split)
+        (2 if policy in ("two-pass", "base-sigma") else 1) * _rollout_steps(run, split)
         for policy, split in run.missing
     )
     return training + 2 * passes * one  # each rollout beside its single steps from true positions

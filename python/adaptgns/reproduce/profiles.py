@@ -141,7 +141,7 @@ def longer(percent: int, budget: Model) -> tuple[Model, Model, Model]:
     chosen = Chosen(f"{NLL.name}-{percent}", f"{budget.name}-{percent}", f"sweep-{percent}")
     return (
         of(MSE, timed_as=MSE.name, policies=("fixed", "divergence")),
-        of(NLL, timed_as=NLL.name),
+        of(NLL, timed_as=NLL.name, policies=(*NLL.policies, "base-sigma")),
         of(TUNED, chosen=chosen),
     )
 
@@ -159,6 +159,15 @@ ADAPTIVE_NLL = replace(
     title="AdaptGNS, trained on adaptive graphs",
     graph="adaptive",
     policies=("fixed", "adaptive", "random"),
+)
+LONG_NARROW = replace(
+    ADAPTIVE_NLL,
+    name="nll-narrow-400",
+    title="AdaptGNS, trained on adaptive graphs of r 0.01425, 400 % of the steps, one seed",
+    radius=0.95,  # so that they have about as many edges as fixed graphs of the data's radius
+    share=4.0,
+    seeds=1,
+    policies=("fixed", "adaptive", "random", "base-sigma"),
 )
 TWO_SIDED_NLL = replace(
     NLL,
@@ -232,7 +241,9 @@ PAPER_MODELS = (
     TUNED,
 )
 
-PROMINENT = {model.name for model in (MSE, NLL, MLP, ADAPTIVE_NLL, TUNED, *LONG, *LONGEST)}
+PROMINENT = {
+    model.name for model in (MSE, NLL, MLP, ADAPTIVE_NLL, TUNED, *LONG, LONG_NARROW, *LONGEST)
+}
 
 
 def one_seed(model: Model) -> Model:
@@ -354,6 +365,7 @@ PROFILES: dict[ProfileName, Profile] = {
             *EARLY,
             LONG_NLL,
             LONG_MSE,
+            LONG_NARROW,
             *LONGEST,
             ADAPTIVE_NLL,
             SHAPED,

@@ -38,7 +38,7 @@ th, td { padding: 3px 9px; border-bottom: 1px solid #dde2e8; text-align: right; 
 th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left; }
 img { max-width: 100%; }
 """
-EXPLAINING = ("two-pass", "knn", *PRIORS)
+EXPLAINING = ("two-pass", "base-sigma", "knn", *PRIORS)
 """Policies that the README leaves to the report"""
 MARKERS = ("<!-- results -->", "<!-- end of results -->")
 
