@@ -247,7 +247,7 @@ def legend(figure: Figure, axes: Axes) -> None:
     """A legend below the panels, with what ``axes`` show; what is more than two lines of it makes
     the figure taller."""
     handles, labels = axes.get_legend_handles_labels()
-    columns = max(1, int(figure.get_figwidth() // (0.5 + 0.06 * max(map(len, labels)))))
+    columns = max(1, int(figure.get_figwidth() // (0.45 + 0.06 * max(map(len, labels)))))
     lines = -(-len(labels) // columns)
     figure.set_figheight(figure.get_figheight() + 0.17 * max(0, lines - 2))
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)

@@ -3,6 +3,7 @@ everywhere."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from adaptgns.figures import BASELINE, DASHES, MARKERS, STYLE, save
 from adaptgns.graph import adaptive_graph
 from adaptgns.palette import SERIES, SIGMA_MAP
 from adaptgns.periodic import minimum_image
-from adaptgns.reproduce.profiles import ADAPTIVE
+from adaptgns.reproduce.profiles import ADAPTIVE, length
 from adaptgns.reproduce.results import Results, Series
 from adaptgns.reproduce.runs import DataSet
 from adaptgns.reproduce.tables import matched, series_label
@@ -31,6 +32,7 @@ COLOURS = {
     "nll": SERIES[1],
     "mlp": SERIES[5],
     "nll-adaptive": SERIES[2],
+    "nll-narrow": "#7a8f00",
     "nll-two-sided": "#2f5fc9",
     "beta-nll": SERIES[3],
     "mse-denser": SERIES[4],
@@ -73,8 +75,8 @@ def _drawn(results: Results) -> Iterator[tuple[str, Figure]]:
 
 
 def colour(series: Series) -> str:
-    """That of its model, or of the one it is a variant of."""
-    name = series.model.name
+    """That of its model, or of the one it is a variant of or trained longer than."""
+    name = re.sub(r"-\d+$", "", series.model.name)
     return COLOURS.get(name) or COLOURS[name.split("-", maxsplit=1)[0]]
 
 
@@ -254,12 +256,10 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                 }
                 ax.plot(cost, error.mean, MARKERS[series.policy], color=tint, zorder=3, **trained)
                 ax.vlines(cost, error.low, error.high, color=tint, lw=0.6, alpha=0.4)
-                plain = model
-                if model.share > 1:
-                    plain = results.study.profile.model(model.name.rsplit("-", maxsplit=1)[0])
-                    label = f"{100 * model.share:.0f} % of the steps, one seed"
-                    trainings[label] = {"color": BASELINE, **trained}
-                models[plain.title] = {"color": tint}
+                longer = length(model.share)
+                if longer:
+                    trainings[longer.removeprefix(", ")] = {"color": BASELINE, **trained}
+                models[model.title.removesuffix(longer)] = {"color": tint}
                 policies[series.policy] = {"color": BASELINE, "marker": MARKERS[series.policy]}
             front = np.array([p for p in means if not any(_dominates(q, p) for q in means)])
             ax.step(*front[front[:, 0].argsort()].T, where="post", color=BASELINE, lw=1.2)

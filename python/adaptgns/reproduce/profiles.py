@@ -34,6 +34,12 @@ class Chosen:
     """Name of the sweep's folder"""
 
 
+def length(share: float) -> str:
+    """What titles say of models that are trained for that many times the profile's steps; nothing
+    of others."""
+    return f", {100 * share:.0f} % of the steps, one seed" if share > 1 else ""
+
+
 @dataclass(frozen=True)
 class Model:
     """One way of training, run with every seed."""
@@ -132,7 +138,7 @@ def longer(percent: int, budget: Model) -> tuple[Model, Model, Model]:
         return replace(
             model,
             name=f"{model.name}-{percent}",
-            title=f"{model.title}, {percent} % of the steps, one seed",
+            title=model.title + length(percent / 100),
             share=percent / 100,
             seeds=1,
             **settings,
@@ -163,8 +169,8 @@ ADAPTIVE_NLL = replace(
 LONG_NARROW = replace(
     ADAPTIVE_NLL,
     name="nll-narrow-400",
-    title="AdaptGNS, trained on adaptive graphs of r 0.01425, 400 % of the steps, one seed",
-    radius=0.95,  # so that they have about as many edges as fixed graphs of the data's radius
+    title="AdaptGNS, trained on adaptive graphs, r 0.01425" + length(4.0),
+    radius=0.95,  # so that there are about as many edges as in fixed graphs of the data's radius
     share=4.0,
     seeds=1,
     policies=("fixed", "adaptive", "random", "base-sigma"),

@@ -52,6 +52,10 @@ def _longer(percent: int) -> tuple[Comparison, ...]:
         ("adaptive or fixed", (nll, "adaptive"), (nll, "fixed")),
         ("uncertain or random", (nll, "adaptive"), (nll, "random")),
         ("two-sided or fixed", (nll, "two-sided"), (nll, "fixed")),
+        ("sigma of the step before or of this one", (nll, "adaptive"), (nll, "two-pass")),
+        ("sigma of adaptive or of fixed graphs", (nll, "adaptive"), (nll, "base-sigma")),
+        ("sigma of fixed graphs, adaptive or fixed", (nll, "base-sigma"), (nll, "fixed")),
+        ("sigma of fixed graphs, uncertain or random", (nll, "base-sigma"), (nll, "random")),
         ("sigma or the divergence around", (nll, "adaptive"), (nll, "divergence")),
         ("the divergence around or fixed", (nll, "divergence"), (nll, "fixed")),
         ("adaptive NLL or fixed MSE: the aim", (nll, "adaptive"), (mse, "fixed")),
@@ -73,6 +77,31 @@ COMPARISONS: tuple[Comparison, ...] = (
     ("uncertain or random particles expanded", ("nll", "adaptive"), ("nll", "random")),
     *_longer(400),
     *_longer(800),
+    (
+        "trained on narrow adaptive graphs, or fixed MSE: the aim, 4 times the training",
+        ("nll-narrow-400", "adaptive"),
+        ("mse-400", "fixed"),
+    ),
+    (
+        "trained on narrow adaptive graphs, or on fixed ones, 4 times the training",
+        ("nll-narrow-400", "adaptive"),
+        ("nll-400", "fixed"),
+    ),
+    (
+        "adaptive or fixed, trained on narrow adaptive graphs, 4 times the training",
+        ("nll-narrow-400", "adaptive"),
+        ("nll-narrow-400", "fixed"),
+    ),
+    (
+        "uncertain or random, trained on narrow adaptive graphs, 4 times the training",
+        ("nll-narrow-400", "adaptive"),
+        ("nll-narrow-400", "random"),
+    ),
+    (
+        "sigma of adaptive or of fixed graphs, trained on narrow adaptive ones, 4 times",
+        ("nll-narrow-400", "adaptive"),
+        ("nll-narrow-400", "base-sigma"),
+    ),
     ("sigma of the step before or of this one", ("nll", "adaptive"), ("nll", "two-pass")),
     ("adaptive NLL or fixed MSE: the aim", ("nll", "adaptive"), ("mse", "fixed")),
     ("the chosen rule or fixed MSE: the aim", ("tuned", "adaptive"), ("mse", "fixed")),
@@ -137,6 +166,11 @@ COMPARISONS: tuple[Comparison, ...] = (
         "adaptive decoupled, latents shaped, or MSE at its edges",
         ("decoupled-weight", "adaptive"),
         ("mse-matched-decoupled", "fixed"),
+    ),
+    (
+        "adaptive decoupled, latents shaped, or MSE of r 0.019",
+        ("decoupled-weight", "adaptive"),
+        ("mse-denser", "fixed"),
     ),
     (
         "adaptive or fixed, decoupled, latents shaped",
@@ -359,6 +393,7 @@ def _comparisons(results: Results, data: DataSet) -> Table:
                     question,
                     f"{first[0]}, {first[1]}",
                     f"{second[0]}, {second[1]}",
+                    _change(results, one, other, "one_step_mse"),
                     *(_change(results, one, other, f"mse@{mark}") for mark in marks),
                     _change(results, one, other, "kinetic_energy_error"),
                     _interval(results.difference(one, other, "edges_per_step"), "+,.0f"),
@@ -381,6 +416,7 @@ def _comparisons(results: Results, data: DataSet) -> Table:
             "question",
             "one",
             "other",
+            "one-step MSE",
             *(f"MSE@{mark}" for mark in marks),
             "kinetic energy error",
             "edges a step",
@@ -388,8 +424,9 @@ def _comparisons(results: Results, data: DataSet) -> Table:
         ),
         rows,
         "In percent of the other's mean. Differences are paired by trajectory and by seed, of the "
-        "seeds that both have; in brackets their 95 % interval, not corrected for the number of "
-        "comparisons.",
+        "seeds that both have; in brackets their 95 % interval, symmetric (Student's t), so that "
+        "one of few heavy-tailed errors may pass -100 %, and not corrected for the number of "
+        "comparisons. Single steps are from true positions.",
     )
 
 
