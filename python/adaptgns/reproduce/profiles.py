@@ -112,7 +112,7 @@ NLL = Model(
 )
 TUNED = Model(
     "tuned",
-    "AdaptGNS, chosen rule",
+    "GNS, NLL, chosen rule",
     "nll",
     policies=("adaptive", "random"),
     chosen=Chosen(weights="nll", budget="mse", folder="sweep"),
@@ -258,7 +258,7 @@ def one_seed(model: Model) -> Model:
     return replace(model, title=f"{model.title}, one seed", seeds=1, policies=policies)
 
 
-ONE_SEED = tuple(map(one_seed, DECOUPLED_VARIANTS))
+ONE_SEED = tuple(map(one_seed, (*DECOUPLED_VARIANTS, BETA_NLL, MATCHED_DECOUPLED)))
 
 
 @dataclass(frozen=True)
@@ -378,8 +378,6 @@ PROFILES: dict[ProfileName, Profile] = {
             DENSER_MSE,
             MIDDLE_NLL,
             MATCHED_MSE,
-            MATCHED_DECOUPLED,
-            BETA_NLL,
             *ONE_SEED,
             TUNED,
             LONG_TUNED,
