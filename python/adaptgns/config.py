@@ -144,8 +144,8 @@ class RolloutConfig:
     """Which part of the data."""
     policy: PolicyName = "fixed"
     """Graph of each step: fixed radius; adaptive (sigma of the step before), two-sided (and shorter
-    edges where it is low), two-pass (sigma of this step), base-sigma (of the step before, but that
-    of fixed graphs); the same share of particles chosen at random, by the acceleration before, or
+    edges where it is low), two-pass (sigma of this step), base-sigma (of the step before, on the
+    base graph); the same share of particles chosen at random, by the acceleration before, or
     by the divergence of the velocities around; knn."""
     adaptive: AdaptiveConfig = field(default_factory=AdaptiveConfig)
     k: int = 6

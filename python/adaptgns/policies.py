@@ -165,8 +165,8 @@ class Divergence:
 
 @dataclass(frozen=True)
 class TwoPass:
-    """The particles most uncertain now see farther, at the price of a second forward pass: what
-    the lag of :class:`Adaptive` costs in accuracy."""
+    """The particles most uncertain now on the base graph see farther, at the price of a second
+    forward pass: :class:`BaseSigma` without the lag."""
 
     name: ClassVar[PolicyName] = "two-pass"
     needs_sigma: ClassVar[bool] = True
@@ -186,12 +186,14 @@ class BaseSigma:
     needs_sigma: ClassVar[bool] = True
     rule: AdaptiveConfig
     before: NDArray[np.float32] | None = None
-    """``[N]``, sigma of the step before; None before the first"""
+    """``[N]``, sigma of the last step on the base graph; None before any"""
 
     def edges(self, state: State) -> Edges:
         base = state.base()
         sigma, self.before = self.before, state.predict_sigma(base)
-        return base if sigma is None else state.expanded(sigma, self.rule)
+        if state.sigma is None or sigma is None:  # the first step of a rollout
+            return base
+        return state.expanded(sigma, self.rule)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from adaptgns.data.trajectories import open_split
 from adaptgns.fit import Diverged
 from adaptgns.reproduce import ReproduceConfig, main, reproduce, study_of
 from adaptgns.reproduce.estimates import seconds
-from adaptgns.reproduce.figures import COLOURS
+from adaptgns.reproduce.figures import colour, pareto_front
 from adaptgns.reproduce.profiles import PROFILES, Model, ProfileName
 from adaptgns.reproduce.report import MARKERS, write_into
 from adaptgns.reproduce.results import Estimate, Results, estimate
@@ -446,7 +446,7 @@ def test_the_readme_gets_the_tables_between_its_marks(
     assert "| GNS, NLL | adaptive |" in text
     assert "400 % of the steps" in text
     # Those are for the report alone.
-    for left_out in ("30 % of the steps", "two-pass", "divergence"):
+    for left_out in ("30 % of the steps", "two-pass", "base-sigma", "divergence"):
         assert left_out not in text
     assert re.search(r"Made with .* on \d{4}-\d\d-\d\d on .* cores, torch", text)
     readme.write_text("no marks")
@@ -503,7 +503,8 @@ def test_the_matched_radius_is_on_a_line_in_its_square(
         ("decoupled-weight", "adaptive"): edges,
     }
 
-    def valid_edges(_data: DataSet, model: Model, _seed: int, policy: PolicyName) -> float:
+    def valid_edges(_data: DataSet, model: Model, seed: int, policy: PolicyName) -> float:
+        assert seed == 0
         return found[model.name, policy]
 
     monkeypatch.setattr("adaptgns.reproduce.runs.valid_edges", valid_edges)
@@ -596,10 +597,40 @@ def test_differences_are_paired(made: ReproduceConfig) -> None:
     )
 
 
-@pytest.mark.parametrize("preset", ["laptop", "full"])
+@pytest.mark.parametrize("preset", ["smoke", "laptop", "full", "paper"])
 def test_models_of_the_same_length_differ_in_colour(preset: ProfileName) -> None:
-    names = [model.name for model in PROFILES[preset].models if model.share == 1]
-    assert len({COLOURS[name] for name in names}) == len(names)
+    colours: dict[str, set[str]] = {}
+    models = PROFILES[preset].models
+    for model in models:
+        colours.setdefault(model.length, set()).add(colour(model))
+    counts = {length: sum(model.length == length for model in models) for length in colours}
+    assert {length: len(found) for length, found in colours.items()} == counts
+
+
+def test_titles_tell_length_and_seeds() -> None:
+    laptop = PROFILES["laptop"]
+    titles = {name: laptop.model(name).title for name in ("nll", "nll-30", "nll-400", "beta-nll")}
+    assert titles == {
+        "nll": "GNS, NLL",
+        "nll-30": "GNS, NLL, 30 % of the steps",
+        "nll-400": "GNS, NLL, 400 % of the steps, one seed",
+        "beta-nll": "GNS, beta-NLL, one seed",
+    }
+
+
+@pytest.mark.parametrize(
+    ("points", "front"),
+    [
+        ([(3.0, 1.0), (1.0, 2.0), (2.0, 2.0), (2.0, 3.0)], [(1.0, 2.0), (3.0, 1.0)]),
+        ([(1.0, 2.0), (1.0, 1.0), (1.0, 1.0)], [(1.0, 1.0)]),
+        ([(1.0, float("nan")), (2.0, 1.0)], [(2.0, 1.0)]),
+        ([], []),
+    ],
+)
+def test_the_front_is_what_nothing_undercuts(
+    points: list[tuple[float, float]], front: list[tuple[float, float]]
+) -> None:
+    assert [tuple(point) for point in pareto_front(points)] == front
 
 
 def test_only_seeds_of_both_are_compared(made: ReproduceConfig) -> None:

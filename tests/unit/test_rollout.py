@@ -31,7 +31,7 @@ from adaptgns.data.errors import DataError
 from adaptgns.data.metadata import Metadata, read_metadata, write_metadata
 from adaptgns.data.trajectories import Trajectory, open_split
 from adaptgns.policies import Adaptive, Edges, Fixed, State, make_policy
-from adaptgns.rollout import directed_edges, main, steps, write_rollouts
+from adaptgns.rollout import main, steps, write_rollouts
 from adaptgns.simulator import Simulator
 
 RULE = AdaptiveConfig(tau=70, factor=1.5)
@@ -92,21 +92,38 @@ def test_base_sigma_is_that_of_the_fixed_graph_one_step_ago(
 ) -> None:
     fixed = list(steps(simulator, trajectory, Fixed(), 4, teacher_forcing=True))
     policy = make_policy("base-sigma", RULE, k=0, seed=0)
-    states: list[State] = []
+    seen: list[tuple[State, Edges]] = []
 
     class Spy:
         name, needs_sigma = policy.name, policy.needs_sigma
 
         def edges(self, state: State) -> Edges:
-            states.append(state)
-            return policy.edges(state)
+            edges = policy.edges(state)
+            seen.append((state, edges))
+            return edges
 
-    made = list(steps(simulator, trajectory, Spy(), 4, teacher_forcing=True))
-    assert made[0].edges == fixed[0].edges
-    for before, state, step in zip(fixed, states[1:], made[1:], strict=False):
+    def spied(trajectory: Trajectory) -> None:
+        seen.clear()
+        list(steps(simulator, trajectory, Spy(), 4, teacher_forcing=True))
+        first, edges = seen[0]
+        np.testing.assert_array_equal(edges[0], first.base()[0])
+
+    spied(trajectory)
+    fed_back = False
+    for before, (state, edges) in zip(fixed[:-1], seen[1:], strict=True):
         assert before.sigma is not None
-        expected = state.expanded(before.sigma, RULE)
-        assert step.edges == directed_edges(expected, state.self_edges) > state.base()[0].shape[1]
+        assert state.sigma is not None
+        np.testing.assert_array_equal(edges[0], state.expanded(before.sigma, RULE)[0])
+        assert edges[0].shape[1] > state.base()[0].shape[1]
+        fed_back |= not np.array_equal(edges[0], state.expanded(state.sigma, RULE)[0])
+    assert fed_back, "nothing tells it from the policy adaptive"
+    # The same policy goes on with another rollout, of fewer particles.
+    fewer = replace(
+        trajectory,
+        positions=trajectory.positions[:, 1:],
+        particle_type=trajectory.particle_type[1:],
+    )
+    spied(fewer)
 
 
 def test_random_is_seeded(simulator: Simulator, trajectory: Trajectory) -> None:

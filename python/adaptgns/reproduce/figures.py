@@ -22,7 +22,7 @@ from adaptgns.figures import BASELINE, DASHES, MARKERS, STYLE, save
 from adaptgns.graph import adaptive_graph
 from adaptgns.palette import SERIES, SIGMA_MAP
 from adaptgns.periodic import minimum_image
-from adaptgns.reproduce.profiles import ADAPTIVE, length
+from adaptgns.reproduce.profiles import ADAPTIVE, Model
 from adaptgns.reproduce.results import Results, Series
 from adaptgns.reproduce.runs import DataSet
 from adaptgns.reproduce.tables import matched, series_label
@@ -74,10 +74,9 @@ def _drawn(results: Results) -> Iterator[tuple[str, Figure]]:
     yield "clouds", _clouds(results, sets)
 
 
-def colour(series: Series) -> str:
-    """That of its model, or of the one it is a variant of or trained longer than."""
-    name = re.sub(r"-\d+$", "", series.model.name)
-    return COLOURS.get(name) or COLOURS[name.split("-", maxsplit=1)[0]]
+def colour(model: Model) -> str:
+    """Of that model, or of the one that it was trained longer or shorter than."""
+    return COLOURS[re.sub(r"-\d+$", "", model.name)]
 
 
 def _panels(count: int, height: float, rows: int = 1) -> tuple[Figure, Any]:
@@ -216,7 +215,7 @@ def _long(results: Results) -> Figure:
 def _band(ax: Axes, curves: NDArray[np.float64], series: Series) -> None:
     """The mean over the seeds, and from the lowest to the highest."""
     steps = np.arange(1, curves.shape[1] + 1)
-    tint = colour(series)
+    tint = colour(series.model)
     ax.plot(
         steps,
         curves.mean(0),
@@ -235,7 +234,7 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
     policies: dict[str, dict[str, Any]] = {}
     for panels, data in zip(rows, sets, strict=True):
         for ax, unit in zip(panels, ("directed edges a step", "milliseconds a step"), strict=True):
-            means = []
+            means: list[tuple[float, float]] = []
             for series in results.of(data.name):
                 model = series.model
                 if not model.edges or not model.prominent:
@@ -248,7 +247,7 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                         continue
                     cost = time["graph_ms"] + time["model_ms"]
                 means.append((cost, error.mean))
-                tint = colour(series)
+                tint = colour(model)
                 # Hollow, and the larger the longer they were trained, are those trained for longer.
                 trained = {
                     "markerfacecolor": "none" if model.share > 1 else tint,
@@ -256,13 +255,11 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
                 }
                 ax.plot(cost, error.mean, MARKERS[series.policy], color=tint, zorder=3, **trained)
                 ax.vlines(cost, error.low, error.high, color=tint, lw=0.6, alpha=0.4)
-                longer = length(model.share)
-                if longer:
-                    trainings[longer.removeprefix(", ")] = {"color": BASELINE, **trained}
-                models[model.title.removesuffix(longer)] = {"color": tint}
+                if model.length:
+                    trainings[model.length] = {"color": BASELINE, **trained}
+                models[model.plain] = {"color": tint}
                 policies[series.policy] = {"color": BASELINE, "marker": MARKERS[series.policy]}
-            front = np.array([p for p in means if not any(_dominates(q, p) for q in means)])
-            ax.step(*front[front[:, 0].argsort()].T, where="post", color=BASELINE, lw=1.2)
+            ax.step(*pareto_front(means).T, where="post", color=BASELINE, lw=1.2)
             ax.set(title=f"{data.name}: MSE@{mark}, length²", xlabel=unit, yscale="log")
             ax.margins(0.15)
     for label, style in (models | policies | trainings).items():
@@ -271,9 +268,14 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
     return figure
 
 
-def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Whether ``one`` has no more cost and no more error than ``other``, and less of either."""
-    return one != other and one[0] <= other[0] and one[1] <= other[1]
+def pareto_front(points: list[tuple[float, float]]) -> NDArray[np.float64]:
+    """``[F, 2]``, by cost: those of the ``points`` of cost and error that no other undercuts in one
+    without exceeding it in the other; what is not finite is none."""
+    front: list[tuple[float, float]] = []
+    for point in sorted({point for point in points if np.isfinite(point).all()}):
+        if not front or point[1] < front[-1][1]:
+            front.append(point)
+    return np.array(front, dtype=np.float64).reshape(-1, 2)
 
 
 def _reliability(results: Results, sets: list[DataSet]) -> Figure:
@@ -288,7 +290,7 @@ def _reliability(results: Results, sets: list[DataSet]) -> Figure:
                 ax.plot(
                     one,
                     other,
-                    color=colour(series),
+                    color=colour(series.model),
                     alpha=min(1.0, 0.4 + 0.6 * series.model.share),
                     linestyle="-" if series.model.share == 1 else ":",
                     linewidth=max(1.0, 0.7 * series.model.share**0.5),
@@ -325,7 +327,7 @@ def _clouds(results: Results, sets: list[DataSet]) -> Figure:
             transport.plot(
                 marks,
                 values,
-                color=colour(series),
+                color=colour(series.model),
                 linestyle=DASHES[policy],
                 marker=MARKERS[policy],
                 markersize=3,

@@ -34,18 +34,13 @@ class Chosen:
     """Name of the sweep's folder"""
 
 
-def length(share: float) -> str:
-    """What titles say of models that are trained for that many times the profile's steps; nothing
-    of others."""
-    return f", {100 * share:.0f} % of the steps, one seed" if share > 1 else ""
-
-
 @dataclass(frozen=True)
 class Model:
     """One way of training, run with every seed."""
 
     name: str
-    title: str
+    plain: str
+    """Its title, but for how it is trained: :attr:`length`"""
     loss: Loss
     edges: bool = True
     radius: float | Literal["matched"] = 1.0
@@ -69,6 +64,17 @@ class Model:
     policies: tuple[PolicyName, ...] = ("fixed",)
     chosen: Chosen | None = None
     """Of a model that is another one's training under a rule of its own"""
+
+    @property
+    def length(self) -> str:
+        """What sets its training apart from that of others of its kind; as a rule nothing."""
+        share = "" if self.share == 1 else f"{100 * self.share:.0f} % of the steps"
+        return ", ".join(filter(None, (share, "one seed" if self.seeds == 1 else "")))
+
+    @property
+    def title(self) -> str:
+        """Names it in tables and figures."""
+        return ", ".join(filter(None, (self.plain, self.length)))
 
     @property
     def prominent(self) -> bool:
@@ -121,7 +127,6 @@ EARLY = tuple(
     replace(
         NLL,
         name=f"nll-{percent}",
-        title=f"GNS, NLL, {percent} % of the steps",
         share=percent / 100,
         timed_as="nll",
         policies=("fixed", "adaptive", "random"),
@@ -138,7 +143,6 @@ def longer(percent: int, budget: Model) -> tuple[Model, Model, Model]:
         return replace(
             model,
             name=f"{model.name}-{percent}",
-            title=model.title + length(percent / 100),
             share=percent / 100,
             seeds=1,
             **settings,
@@ -162,14 +166,14 @@ LONGEST = on_water(longer(800, budget=MSE))
 ADAPTIVE_NLL = replace(
     NLL,
     name="nll-adaptive",
-    title="AdaptGNS, trained on adaptive graphs",
+    plain="AdaptGNS, trained on adaptive graphs",
     graph="adaptive",
     policies=("fixed", "adaptive", "random"),
 )
 LONG_NARROW = replace(
     ADAPTIVE_NLL,
     name="nll-narrow-400",
-    title="AdaptGNS, trained on adaptive graphs, r 0.01425" + length(4.0),
+    plain="AdaptGNS, trained on adaptive graphs, r 0.01425",
     radius=0.95,  # so that there are about as many edges as in fixed graphs of the data's radius
     share=4.0,
     seeds=1,
@@ -178,7 +182,7 @@ LONG_NARROW = replace(
 TWO_SIDED_NLL = replace(
     NLL,
     name="nll-two-sided",
-    title="AdaptGNS, trained on two-sided graphs",
+    plain="AdaptGNS, trained on two-sided graphs",
     graph="two-sided",
     policies=("fixed", "two-sided"),
 )
@@ -191,43 +195,43 @@ DECOUPLED = Model(
 SHAPED = replace(
     DECOUPLED,
     name="decoupled-weight",
-    title="GNS, decoupled, latents shaped with weight 0.1",
+    plain="GNS, decoupled, latents shaped with weight 0.1",
     variance_weight=0.1,
 )
 DECOUPLED_VARIANTS = (
     replace(
         DECOUPLED,
         name="decoupled-deep",
-        title="GNS, decoupled, variance head of three layers",
+        plain="GNS, decoupled, variance head of three layers",
         variance_layers=3,
     ),
     replace(
         SHAPED,
         name="decoupled-ahead",
-        title="GNS, decoupled, sigma of the next step",
+        plain="GNS, decoupled, sigma of the next step",
         variance_ahead=True,
     ),
 )
 DENSER_MSE = replace(
-    MSE, name="mse-denser", title="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)
+    MSE, name="mse-denser", plain="GNS, MSE, r 0.019", radius=DENSER, policies=("fixed",)
 )
 MIDDLE_NLL = replace(
-    NLL, name="nll-middle", title="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)
+    NLL, name="nll-middle", plain="GNS, NLL, r 0.0176", radius=MIDDLE, policies=("fixed",)
 )
 MATCHED_MSE = replace(
-    MSE, name="mse-matched", title="GNS, MSE, matched r", radius="matched", policies=("fixed",)
+    MSE, name="mse-matched", plain="GNS, MSE, matched r", radius="matched", policies=("fixed",)
 )
 BETA_NLL = replace(
     NLL,
     name="beta-nll",
-    title="GNS, beta-NLL",
+    plain="GNS, beta-NLL",
     loss="beta-nll",
     policies=("fixed", "adaptive", "random"),
 )
 MATCHED_DECOUPLED = replace(
     MATCHED_MSE,
     name="mse-matched-decoupled",
-    title="GNS, MSE, r matched to decoupled's edges",
+    plain="GNS, MSE, r matched to decoupled's edges",
     matches=SHAPED.name,
 )
 PAPER_MODELS = (
@@ -255,7 +259,7 @@ PROMINENT = {
 def one_seed(model: Model) -> Model:
     """``model`` with the first seed alone, and without two-sided graphs."""
     policies = tuple(policy for policy in model.policies if policy != "two-sided")
-    return replace(model, title=f"{model.title}, one seed", seeds=1, policies=policies)
+    return replace(model, seeds=1, policies=policies)
 
 
 ONE_SEED = tuple(map(one_seed, (*DECOUPLED_VARIANTS, BETA_NLL, MATCHED_DECOUPLED)))

@@ -24,7 +24,8 @@ CAPTIONS = {
     "steps": "Figure 3: edges and errors at every step; bands reach from the lowest to the highest "
     "seed.",
     "pareto": "What the error costs, in edges and in time, with its 95 % interval; hollow: models "
-    "trained for longer; line: what nothing else undercuts in both, in the mean.",
+    "trained for longer; line: what no other model shown undercuts, in the mean. Times of another "
+    "processor are left out.",
     "reliability": "Predicted and measured errors by deciles, a line for each seed.",
     "long": "Long rollouts: the error, and edges within the data's radius, predicted over true.",
     "clouds": "Kinetic energy, and the distance between predicted and true clouds.",
