@@ -109,7 +109,7 @@ def main() -> None:
             }
             rows.append(
                 {
-                    "data": checkpoint.config.data,
+                    "checkpoint": "/".join(Path(name).parts[-2:]),
                     "loss": checkpoint.config.loss,
                     "graph": checkpoint.config.graph,
                     "seed": checkpoint.config.seed,
