@@ -168,6 +168,11 @@ COMPARISONS: tuple[Comparison, ...] = (
         ("mse-matched", "fixed"),
     ),
     (
+        "adaptive decoupled, latents shaped, or MSE at the edges of NLL",
+        ("decoupled-weight", "adaptive"),
+        ("mse-matched", "fixed"),
+    ),
+    (
         "adaptive decoupled, latents shaped, or MSE at its edges",
         ("decoupled-weight", "adaptive"),
         ("mse-matched-decoupled", "fixed"),
