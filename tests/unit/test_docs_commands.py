@@ -25,7 +25,7 @@ def test_every_command_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         assert "\nusage: python -m adaptgns." in section
         assert "-h, --help" in section
     told = dict(zip(COMMANDS, sections, strict=True))
-    assert "--tau FLOAT           Percentile of sigma" in told["rollout"]
+    assert "--tau FLOAT Percentile of sigma" in " ".join(told["rollout"].split())
     assert "(length per frame). (default: 0.00015)" in " ".join(told["train"].split())
     for subcommand in SUBCOMMANDS:
         assert f"\n### plot {subcommand}\n" in told["plot"]
