@@ -1,10 +1,14 @@
 """What longer edges do to the sigma that the next ones are chosen by.
 
-    python benchmarks/feedback.py waterdrop sand --out benchmarks/results/feedback.json
+    T=results/laptop/training
+    python benchmarks/feedback.py $T/waterdrop/nll-0 waterdrop $T/waterdrop/nll-800-0 \\
+        $T/waterdrop/nll-narrow-400-0 $T/sand/nll-0 sand $T/sand/nll-narrow-400-0 \\
+        --out benchmarks/results/feedback.json
 
-Models of the package, or run folders, step from the true positions of their data's test
-trajectories, while the particles of the highest sigma one step ago see farther, or random ones. In
-each step a second pass tells sigma on the base graph. Reported are, in means over the steps:
+Models of the package (``waterdrop``, ``sand``) and run folders, here of the study that ``python -m
+adaptgns.reproduce`` makes, step from the true positions of their data's test trajectories, while
+the particles of the highest sigma one step ago see farther, or random ones. In each
+step a second pass tells sigma on the base graph. Reported are, in means over the steps:
 
 - ``expanded``, ``others``: sigma on the step's graph over that on the base graph, of the particles
   that see farther and of the others (geometric means);

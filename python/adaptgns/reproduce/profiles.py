@@ -174,7 +174,7 @@ LONG_NARROW = replace(
     ADAPTIVE_NLL,
     name="nll-narrow-400",
     plain="AdaptGNS, trained on adaptive graphs, r 0.01425",
-    radius=0.95,  # so that there are about as many edges as in fixed graphs of the data's radius
+    radius=0.95,  # meant to have no more edges than fixed graphs of the data's radius
     share=4.0,
     seeds=1,
     policies=("fixed", "adaptive", "random", "base-sigma"),
