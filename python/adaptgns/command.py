@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from adaptgns.data.errors import DataWarning
 from adaptgns.interruption import Terminated, termination
+
+_formatwarning = warnings.formatwarning
 
 
 @contextmanager
@@ -15,6 +19,8 @@ def plain_errors(*also: type[Exception]) -> Iterator[None]:
     in one line on standard error instead of a traceback, and exit: with 2, after Ctrl-C with 130,
     after SIGTERM with 143."""
     told: tuple[type[Exception], ...] = (ValueError, OSError, MemoryError, *also)
+    formatted = warnings.formatwarning
+    warnings.formatwarning = _formatted
     try:
         with termination():
             yield
@@ -27,6 +33,21 @@ def plain_errors(*also: type[Exception]) -> Iterator[None]:
     except told as error:
         print(f"error: {_described(error)}", file=sys.stderr)
         raise SystemExit(2) from None
+    finally:
+        warnings.formatwarning = formatted
+
+
+def _formatted(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+) -> str:
+    """What is wrong with data in a line, whoever found it; other warnings as ever."""
+    if issubclass(category, DataWarning):
+        return f"warning: {message}\n"
+    return _formatwarning(message, category, filename, lineno, line)
 
 
 def _described(error: Exception) -> str:

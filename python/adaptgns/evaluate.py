@@ -55,7 +55,8 @@ class EvaluateConfig:
     out: Path | None = None
     """Folder for metrics.json; None: that of the first rollout file."""
     steps: tuple[int, ...] = MARKS
-    """Predicted frames at which errors are reported."""
+    """Predicted frames at which errors are reported; where all rollouts end before the first of
+    these defaults, the last step that they have in common is."""
 
 
 def evaluate(
@@ -86,7 +87,7 @@ def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
         raise ValueError("steps: got none; one or more are accepted")
     if any(mark < 1 for mark in marks):
         raise ValueError(f"steps: got {list(marks)}; steps are counted from 1")
-    marks = sorted(set(marks))
+    asked = sorted(set(marks))
     with ExitStack() as stack:
         opened = [stack.enter_context(RolloutFile(path)) for path in files]
         check_same_trajectories(opened)
@@ -94,6 +95,7 @@ def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
         names = [rollout.name for rollout in first]
         shortest = min(rollout.steps for file in opened for rollout in file)
         statistics_step = min(STATISTICS_STEP, shortest)
+        marks = [shortest] if tuple(asked) == MARKS and shortest < MARKS[0] else asked
         truth_statistics: list[GraphStatistics] = []
         tallies = [Tally() for _ in opened]
         baselines: dict[str, Tally] = defaultdict(Tally)
@@ -124,6 +126,7 @@ def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
             notes=[
                 *short_notes(measures, marks),
                 *divergence_notes(measures, names),
+                *gap_notes(measures, names),
                 *unit_notes(opened),
             ],
         )
@@ -364,6 +367,26 @@ def divergence_notes(measures: Sequence[Measures], names: Sequence[str]) -> list
             ]
         )
     ]
+
+
+def gap_notes(measures: Sequence[Measures], names: Sequence[str]) -> list[str]:
+    """Where a mean is not given, since a trajectory of a rollout that did not diverge lacks it."""
+    reasons = {
+        "clumping": "no true edges there",
+        "transport": f"more than {MATCHED:,} particles to match",
+    }
+    notes = {}
+    for row in measures:
+        diverged = ~np.isfinite(row.scalars["mse"])
+        for scalar, values in row.scalars.items():
+            kind = scalar.partition("@")[0]
+            without = ~np.isfinite(values) & ~diverged
+            if kind in reasons and without.any():
+                lacking = ", ".join(np.array(names)[without])
+                notes[scalar, lacking] = (
+                    f"no mean {scalar}, for want of one of trajectory {lacking}: {reasons[kind]}"
+                )
+    return list(notes.values())
 
 
 def unit_notes(files: Sequence[RolloutFile]) -> list[str]:

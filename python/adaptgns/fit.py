@@ -35,6 +35,7 @@ from adaptgns.policies import two_sided
 from adaptgns.processes import ALONE, Processes
 from adaptgns.progress import progress_bar
 from adaptgns.rollout import to_sigma
+from adaptgns.run_folder import LOG, read_log
 from adaptgns.segment import Graph
 from adaptgns.snapshot import snapshot
 from adaptgns.threads import thread_count
@@ -382,9 +383,8 @@ class Trainer:
         log.write(self.step, scores)
         log.show(self.step, self.metadata, validation)
         c = self.config
-        first_settled = (
-            c.schedule == "cosine" and self.step >= SETTLED * c.steps > self.step - c.validate_every
-        )
+        before = (self.step - 1) // c.validate_every * c.validate_every  # the last validation
+        first_settled = c.schedule == "cosine" and self.step >= SETTLED * c.steps > before
         if first_settled or scores["valid_rollout_mse"] < self.best_score:
             self.best_score = scores["valid_rollout_mse"]
             write_checkpoint(self.folder / BEST, self.checkpoint(resumable=False))
@@ -397,13 +397,9 @@ class Log:
     """
 
     def __init__(self, folder: Path, step: int) -> None:
-        path = folder / "metrics.jsonl"
-        kept = []
-        if path.exists():
-            for line in path.read_text().splitlines(keepends=True):
-                # A killed run may leave half a line.
-                if line.endswith("\n") and json.loads(line)["step"] <= step:
-                    kept.append(line)
+        path = folder / LOG
+        lines = read_log(path) if path.exists() else []
+        kept = [json.dumps(line) + "\n" for line in lines if line["step"] <= step]
         path.write_text("".join(kept))
         self.file = path.open("a")
         self.board = SummaryWriter(folder / "tensorboard", purge_step=step + 1)

@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
-from adaptgns._core import radius_graph
+from adaptgns.graph import radius_graph
 
-_WEDGES_AT_A_TIME = 1 << 22
-"""Pairs of neighbours looked up together: about 100 MiB."""
+_PATHS = 1 << 27
+"""Paths of two edges that are looked at, at most: a second or two."""
+_PATHS_AT_A_TIME = 1 << 22
+"""Of these: about 50 MiB."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,8 @@ class GraphStatistics:
         degree: neighbours per particle, on average.
         clustering: mean over all particles of the share of its pairs of neighbours that are
             neighbours themselves, 0 for fewer than two neighbours (Watts and Strogatz 1998;
-            networkx's `average_clustering`).
+            networkx's `average_clustering`). In a graph with so many neighbours that this would
+            take long, the mean over every second particle, or third, and so on.
     """
 
     nodes: int
@@ -51,7 +55,7 @@ def graph_statistics(
         ValueError: as `radius_graph` does.
     """
     nodes = len(positions)
-    sender, receiver = radius_graph(positions, radius, box=box)
+    (sender, _), offsets = radius_graph(positions, radius, box=box, return_offsets=True)
     edges = len(sender) // 2
     pairs = nodes * (nodes - 1) // 2
     return GraphStatistics(
@@ -59,37 +63,29 @@ def graph_statistics(
         edges=edges,
         density=edges / pairs if pairs else 0.0,
         degree=len(sender) / nodes if nodes else 0.0,
-        clustering=_average_clustering(sender, receiver, nodes),
+        clustering=_average_clustering(offsets, sender),
     )
 
 
-def _average_clustering(
-    sender: npt.NDArray[np.int64], receiver: npt.NDArray[np.int64], nodes: int
-) -> float:
-    """Counts, for each edge (i, a) and each neighbour b of i, whether a and b are connected.
+def _average_clustering(offsets: npt.NDArray[np.int64], sender: npt.NDArray[np.int64]) -> float:
+    """From the neighbours of each particle i, ``sender[offsets[i] : offsets[i + 1]]``.
 
-    The edges are sorted by receiver, then sender, so `receiver * N + sender` is sorted too, and
-    an edge is looked up by bisection.
+    The square of the adjacency matrix counts the paths of two edges; those that an edge closes are
+    the pairs of neighbours that are neighbours.
     """
-    degree = np.bincount(receiver, minlength=nodes)
-    keys = receiver * nodes + sender
-    first = np.concatenate([[0], np.cumsum(degree)])
-    wedges = degree[receiver]
-    closed = np.zeros(nodes, dtype=np.int64)
-    end = np.cumsum(wedges)
-    start = 0
-    while start < len(sender):
-        done = end[start] - wedges[start]
-        stop = max(int(np.searchsorted(end, done + _WEDGES_AT_A_TIME, side="right")), start + 1)
-        count = wedges[start:stop]
-        edge = np.repeat(np.arange(start, stop), count)
-        # The k-th wedge of an edge leads to the k-th neighbour of its receiver.
-        k = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
-        other = sender[first[receiver[edge]] + k]
-        wanted = sender[edge] * nodes + other
-        found = keys[np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)] == wanted
-        closed += np.bincount(receiver[edge[found]], minlength=nodes)
-        start = stop
-    possible = degree * (degree - 1)
-    share = np.divide(closed, possible, out=np.zeros(nodes), where=possible > 0)
-    return float(share.mean()) if nodes else 0.0
+    nodes = len(offsets) - 1
+    if not nodes:
+        return 0.0
+    degree = np.diff(offsets)
+    paths = np.add.reduceat(np.append(degree[sender], 0), offsets[:-1]) * (degree > 0)
+    looked_at = np.arange(0, nodes, max(1, -(-int(paths.sum()) // _PATHS)))
+    adjacent = csr_array((np.ones(len(sender), np.int32), sender, offsets), shape=(nodes, nodes))
+    share = np.zeros(len(looked_at))
+    blocks = np.cumsum(paths[looked_at]) // _PATHS_AT_A_TIME
+    for block in np.unique(blocks):
+        part = blocks == block
+        own = adjacent[looked_at[part]]
+        closed = (own @ adjacent).multiply(own).sum(axis=1)
+        possible = degree[looked_at[part]] * (degree[looked_at[part]] - 1)
+        share[part] = closed / np.maximum(possible, 1)
+    return float(share.mean())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,10 +16,11 @@ from adaptgns.command import plain_errors
 from adaptgns.data.check import Problem, find_problems
 from adaptgns.data.default import dataset_folder
 from adaptgns.data.errors import DataError
-from adaptgns.data.metadata import Metadata, read_metadata
-from adaptgns.data.radius import NEIGHBOURS, DegreeCurve
+from adaptgns.data.metadata import RADIUS_KEY, Metadata, read_metadata, states_radius
+from adaptgns.data.radius import NEIGHBOURS, DegreeCurve, advise_radius
 from adaptgns.data.statistics import FILE_KEYS, compute_statistics
 from adaptgns.data.trajectories import SPLITS, Trajectories, find_split, open_split
+from adaptgns.graph import radius_graph
 from adaptgns.graph_statistics import GraphStatistics, graph_statistics
 
 if TYPE_CHECKING:
@@ -30,9 +31,6 @@ _TIMES = 9
 
 _RADII = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0)
 """Multiples of the radius at which the degree is shown."""
-
-_SUSPICIOUS = 2.0
-"""Stored and computed standard deviations further apart than this factor are told."""
 
 _FEW, _MANY = 0.5, 4.0
 """Mean degrees below and above these multiples of the usual one are told."""
@@ -66,10 +64,10 @@ def inspect(config: InspectConfig, console: Console) -> list[Problem]:
     if config.radius is not None and not (np.isfinite(config.radius) and config.radius > 0):
         raise DataError(f"radius is {config.radius}; a finite number above 0 is accepted")
     folder = dataset_folder(config.data)
-    metadata = read_metadata(folder)
-    radius = metadata.radius if config.radius is None else config.radius
     problems: list[Problem] = []
     splits = _open_all(folder, problems)
+    metadata = _read_metadata(folder, config, splits, problems)
+    radius = metadata.radius if config.radius is None else config.radius
     _print_overview(console, folder, metadata, splits)
     if "train" in splits:
         _print_motion(console, metadata, splits["train"], problems)
@@ -84,9 +82,13 @@ def inspect(config: InspectConfig, console: Console) -> list[Problem]:
         )
     elif find_split(folder, config.split) is None:
         open_split(folder, config.split)  # its error says what the folder holds
-    if "train" in splits and find_split(folder, "valid") is None:
+    absent = [split for split in SPLITS if find_split(folder, split) is None]
+    if "train" in splits and absent:
         problems.append(
-            Problem(f"{folder}: a train split, but no valid; training needs both", fatal=False)
+            Problem(
+                f"{folder}: train, but no {' and no '.join(absent)} split; all three are needed",
+                fatal=False,
+            )
         )
     for trajectories in splits.values():
         found = {problem.message for problem in problems}
@@ -106,6 +108,33 @@ def main(argv: Sequence[str] | None = None) -> None:
         problems = inspect(config, Console(highlight=False))
     if any(problem.fatal for problem in problems):
         raise SystemExit(1)
+
+
+def _read_metadata(
+    folder: Path, config: InspectConfig, splits: dict[str, Trajectories], problems: list[Problem]
+) -> Metadata:
+    """With the radius asked for, or an advised one, where the file states none: that is a problem,
+    but the rest can be looked at."""
+    if states_radius(folder):
+        return read_metadata(folder)
+    metadata = read_metadata(folder, radius=config.radius or 1.0)
+    radius, origin = config.radius, "as asked for"
+    if radius is None:
+        split = splits.get(config.split) or next(iter(splits.values()), None)
+        frames = [] if split is None else _frames(split, config.frame, [])[1]
+        radius = advise_radius(frames, metadata.box) if frames else None
+        if radius is None:
+            low, high = np.array(metadata.bounds).T
+            radius = float((high - low).max())
+        origin = "as below"
+    problems.append(
+        Problem(
+            f"{folder / 'metadata.json'}: no {RADIUS_KEY}; here it is {radius:.4g}, {origin}. "
+            "Training needs one: write it in",
+            fatal=True,
+        )
+    )
+    return replace(metadata, radius=float(f"{radius:.4g}"))
 
 
 def _open_all(folder: Path, problems: list[Problem]) -> dict[str, Trajectories]:
@@ -167,14 +196,6 @@ def _print_motion(
     for name, key in FILE_KEYS.items():
         stored, own = np.array(getattr(metadata, name)), np.array(getattr(computed, name))
         table.add_row(key, _vector(stored), _vector(own))
-        if name.endswith("_std") and (np.abs(np.log(stored / own)) > np.log(_SUSPICIOUS)).any():
-            problems.append(
-                Problem(
-                    f"{train.path.parent / 'metadata.json'}: {key} is {_vector(stored)}, but "
-                    f"{_vector(own)} in {train.path.name}; the unit is length per frame",
-                    fatal=False,
-                )
-            )
     console.print(table)
 
 
@@ -188,17 +209,7 @@ def _print_graphs(
     problems: list[Problem],
 ) -> None:
     """Statistics over the trajectories that can be read; the others become problems."""
-    usable, frames, types = [], [], set()
-    for index, length in enumerate(split.lengths.tolist()):
-        at = min(config.frame, length - 1)
-        try:
-            snapshot = split.window(index, at, at + 1)
-        except DataError as error:
-            problems.append(Problem(str(error), fatal=True))
-            continue
-        usable.append(index)
-        frames.append(snapshot.positions[0])
-        types.update(snapshot.particle_type.tolist())
+    usable, frames, types = _frames(split, config.frame, problems)
     if not usable:
         return
     console.print(f"\nparticle types in {config.split}: {', '.join(map(str, sorted(types)))}")
@@ -209,6 +220,25 @@ def _print_graphs(
     _print_statistics(console, title, statistics)
     _print_degree_over_time(console, radius, metadata, split, usable)
     _print_degree_by_radius(console, radius, metadata, frames, problems)
+
+
+def _frames(
+    split: Trajectories, frame: int, problems: list[Problem]
+) -> tuple[list[int], list[np.ndarray], set[int]]:
+    """Of each trajectory that can be read its index and positions `[N, d]` at the frame, or the
+    last; and the particle types in them. The others become problems."""
+    usable, frames, types = [], [], set[int]()
+    for index, length in enumerate(split.lengths.tolist()):
+        at = min(frame, length - 1)
+        try:
+            snapshot = split.window(index, at, at + 1)
+        except DataError as error:
+            problems.append(Problem(str(error), fatal=True))
+            continue
+        usable.append(index)
+        frames.append(snapshot.positions[0])
+        types.update(snapshot.particle_type.tolist())
+    return usable, frames, types
 
 
 def _print_statistics(console: Console, title: str, statistics: list[GraphStatistics]) -> None:
@@ -233,7 +263,8 @@ def _print_degree_over_time(
                 positions = split.window(index, frame, frame + 1).positions[0]
             except DataError:
                 continue  # told by find_problems, which reads every frame
-            degrees.append(graph_statistics(positions, radius, metadata.box).degree)
+            senders, _ = radius_graph(positions, radius, box=metadata.box)
+            degrees.append(len(senders) / len(positions))
         if degrees:
             table.add_row(str(frame), _figures(np.mean(degrees), 3), _figures(np.std(degrees), 2))
     console.print(table)

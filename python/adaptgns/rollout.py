@@ -193,6 +193,32 @@ def open_data(
     return open_split(folder, split)
 
 
+def tell_short(
+    split: Trajectories, count: int | None, wanted: int | None, console: Console
+) -> None:
+    """Say how many of the first ``count`` trajectories end before ``wanted`` steps."""
+    lengths = split.lengths[:count]
+    short = 0 if wanted is None else np.count_nonzero(lengths < HISTORY + wanted)
+    if short:
+        console.print(
+            f"note: {short} of {len(lengths)} trajectories end before step {wanted}, and their "
+            "rollouts with them",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+def _check_neighbours(config: RolloutConfig, split: Trajectories, count: int) -> None:
+    """Refuse, before any rollout, more nearest neighbours than a trajectory has particles."""
+    smallest = int(np.argmin(split.particle_counts[:count]))
+    particles = int(split.particle_counts[smallest])
+    if config.policy == "knn" and config.k >= particles:
+        raise ValueError(
+            f"k: got {config.k}; trajectory {split.names[smallest]} of {split.path} has "
+            f"{particles} particles, so that fewer than that are accepted"
+        )
+
+
 def write_rollouts(config: RolloutConfig, console: Console) -> None:
     """Roll out the trajectories that ``config`` asks for, and write them to ``config.out``."""
     checkpoint = read_checkpoint(config.checkpoint)
@@ -200,15 +226,8 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
     simulator.network.precision = config.precision
     split = open_data(checkpoint, config.data, config.split, console)
     count = len(split) if config.trajectories is None else min(config.trajectories, len(split))
-    if config.steps is not None:
-        short = np.count_nonzero(split.lengths[:count] < HISTORY + config.steps)
-        if short:
-            console.print(
-                f"note: {short} of {count} trajectories end before step {config.steps}, and their "
-                "rollouts with them",
-                highlight=False,
-                soft_wrap=True,
-            )
+    tell_short(split, count, config.steps, console)
+    _check_neighbours(config, split, count)
     known = set(checkpoint.types or ())
     network = "GNS" if simulator.config.edges else "MLP"
     settings = {

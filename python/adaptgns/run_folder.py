@@ -89,7 +89,7 @@ class RunFolder:
         content = _read_report(report) if report.is_file() else {"rollouts": [], "baselines": []}
         return cls(
             name=name,
-            log=_read_log(log) if log.is_file() else [],
+            log=read_log(log) if log.is_file() else [],
             rollouts=[Evaluated(name, row) for row in content["rollouts"]],
             baselines=[Evaluated(name, row) for row in content["baselines"]],
         )
@@ -101,7 +101,8 @@ class RunFolder:
         return steps, np.array([line[key] for line in lines], dtype=np.float64)
 
 
-def _read_log(path: Path) -> list[dict[str, Any]]:
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The lines of a training log; ValueError, with its number, where one is none."""
     lines = path.read_text("utf-8").splitlines(keepends=True)
     if lines and not lines[-1].endswith("\n"):
         lines.pop()  # A killed run may leave half a line.

@@ -40,7 +40,7 @@ from adaptgns.data.trajectories import Trajectories
 from adaptgns.figures import STYLE, save
 from adaptgns.metrics import clumping, edge_counts, position_mse
 from adaptgns.policies import Adaptive
-from adaptgns.rollout import open_data, steps
+from adaptgns.rollout import open_data, steps, tell_short
 from adaptgns.simulator import Simulator
 
 JOURNAL, RESULT, HEAT_MAP = "journal.log", "sweep.json", "sweep"
@@ -68,9 +68,9 @@ class SweepConfig:
     """Expansion factors, likewise."""
     radius: tuple[float, ...] = ()
     """Base radii of the graph (length units of the data), likewise; none: that of training."""
-    sampler: Literal["grid", "tpe", "random", "cmaes"] = "grid"
-    """grid takes every combination; the others draw, tpe (Bergstra et al. 2011) and cmaes (Hansen)
-    where good trials lay."""
+    sampler: Literal["grid", "tpe", "random"] = "grid"
+    """grid takes every combination; the others draw, tpe (Bergstra et al. 2011) where good trials
+    lay."""
     trials: int | None = None
     """Trials at most, of all processes together; None: the whole grid, or 30."""
     edges: float | None = None
@@ -91,6 +91,12 @@ class SweepConfig:
         for name in ("tau", "factor"):
             if not getattr(self, name):
                 raise ValueError(f"{name}: got none; one or more are accepted")
+        for name in ("tau", "factor", "radius"):
+            values = getattr(self, name)
+            if len(set(values)) < len(values):
+                raise ValueError(
+                    f"{name}: got {', '.join(map(str, values))}; each value is accepted once"
+                )
         for tau, factor in product(self.tau, self.factor):
             AdaptiveConfig(tau, factor)  # which checks them
         for name in ("trials", "edges", "steps", "trajectories"):
@@ -109,6 +115,7 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
     checkpoint = read_checkpoint(config.checkpoint)
     simulator = checkpoint.simulator().to(torch_device(config.device))
     split = open_data(checkpoint, config.data, config.split, console)
+    tell_short(split, config.trajectories, config.steps, console)
     config = replace(config, radius=config.radius or (simulator.radius,))
     space = {"tau": config.tau, "factor": config.factor, "radius": config.radius}
     config.out.mkdir(parents=True, exist_ok=True)
@@ -215,8 +222,6 @@ def _sampler(config: SweepConfig) -> optuna.samplers.BaseSampler:
     match config.sampler:
         case "tpe":
             return optuna.samplers.TPESampler(seed=seed)
-        case "cmaes":
-            return optuna.samplers.CmaEsSampler(seed=seed)
         case _:  # of a grid each combination is named
             return optuna.samplers.RandomSampler(seed=seed)
 

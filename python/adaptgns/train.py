@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 import tyro
+from filelock import FileLock, Timeout
 from rich.console import Console
 
 from adaptgns.atomic import replace_text
-from adaptgns.checkpoint import LAST, checkpoint_file, read_checkpoint
+from adaptgns.checkpoint import LAST, Checkpoint, checkpoint_file, read_checkpoint
 from adaptgns.command import plain_errors
 from adaptgns.config import (
     PolicyName,
@@ -25,7 +30,7 @@ from adaptgns.config import (
 )
 from adaptgns.data.check import check_split
 from adaptgns.data.default import dataset_folder
-from adaptgns.data.metadata import read_metadata
+from adaptgns.data.metadata import Metadata, read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.evaluate import evaluate
 from adaptgns.fit import Trainer, TrainingStopped
@@ -36,6 +41,9 @@ from adaptgns.rollout import write_rollouts
 from adaptgns.threads import divide_threads
 
 CONFIG = "config.json"
+LOCK = ".lock"
+NOISE = (0.02, 2.0)
+"""Standard deviations between which training noise is not worth a word"""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -74,15 +82,20 @@ def parse(arguments: list[str]) -> TrainConfig:
     resume, arguments = _take(arguments, "--resume")
     if preset is not None and preset not in PRESETS:
         raise ValueError(f"--preset: got {preset!r}; accepted are {', '.join(PRESETS)}")
+    if len(given := [each for each in (preset, source, resume) if each is not None]) > 1:
+        raise ValueError(
+            f"--preset, --config and --resume: got {', '.join(given)}; accepted is one of them, "
+            "since each is a whole configuration"
+        )
     default = PRESETS[preset or "laptop"]
-    if resume is not None:
-        folder = Path(resume)
-        default = replace(read_checkpoint(folder / LAST).config, resume=folder, out=folder)
+    folder = None if resume is None else Path(resume)
+    if folder is not None:
+        default = replace(_last_checkpoint(folder).config, resume=folder, out=folder)
     elif source is not None:
-        saved = from_json(TrainConfig, json.loads(Path(source).read_text()), source=source)
+        saved = from_json(TrainConfig, _read_object(Path(source)), source=source)
         # A new run, wherever the saved one lay and whether or not it had been resumed.
         default = replace(saved, resume=None, out=None)
-    return tyro.cli(
+    config = tyro.cli(
         TrainConfig,
         default=default,
         args=arguments,
@@ -91,6 +104,33 @@ def parse(arguments: list[str]) -> TrainConfig:
         "starts from the configuration that a run saved, --resume DIR from that of the run it "
         "goes on with; other options change it.",
     )
+    if folder is not None and config.out != folder:
+        raise ValueError(
+            f"--out: got {config.out} beside --resume {folder}; a run goes on in its own folder "
+            "(copy that to keep it as it is)"
+        )
+    return config
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file; ValueError where there is none."""
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not readable as JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: holds a {type(content).__name__}; an object is accepted")
+    return content
+
+
+def _last_checkpoint(folder: Path) -> Checkpoint:
+    """What the run in ``folder`` goes on from; ValueError where there is none."""
+    if not (folder / LAST).is_file():
+        raise ValueError(
+            f"--resume: {folder} holds no {LAST}; accepted is the folder of a run that got as far "
+            "as its first checkpoint"
+        )
+    return read_checkpoint(folder / LAST)
 
 
 def _take(arguments: list[str], option: str) -> tuple[str | None, list[str]]:
@@ -107,8 +147,20 @@ def _take(arguments: list[str], option: str) -> tuple[str | None, list[str]]:
 def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path, Path]:
     """Train by ``config``, as one of the processes of ``group``; the run folder and that of the
     data."""
-    folder = group.same(lambda: run_folder(config))
-    checkpoint = None if config.resume is None else read_checkpoint(config.resume / LAST)
+    checkpoint = None if config.resume is None else _last_checkpoint(config.resume)
+    with ExitStack() as held:
+        folder = group.same(lambda: held.enter_context(run_folder(config)))
+        return folder, _train(config, folder, checkpoint, console, group)
+
+
+def _train(
+    config: TrainConfig,
+    folder: Path,
+    checkpoint: Checkpoint | None,
+    console: Console,
+    group: Processes,
+) -> Path:
+    """Train in ``folder``, from ``checkpoint`` if there is one; the data's folder."""
     threads = config.threads or torch.get_num_threads()
     if torch_device(config.device).type == "cpu":
         divide_threads(threads)
@@ -146,41 +198,82 @@ def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path
         highlight=False,
     )
     if data == Path(config.data) and checkpoint is None:
-        _tell_assumptions(config, console)
+        _tell_assumptions(config, metadata, console)
     trainer.run(console)
-    return folder, data
+    return data
 
 
-def _tell_assumptions(config: TrainConfig, console: Console) -> None:
+def _tell_assumptions(config: TrainConfig, metadata: Metadata, console: Console) -> None:
     """What a preset takes for granted that not all data have."""
+    bounded = not all(metadata.periodic)
     for assumed, what, option in (
-        (config.model.walls, "solid walls at the bounds", "--model.no-walls"),
+        (config.model.walls and bounded, "solid walls at the bounds", "--model.no-walls"),
         (config.mirror, "physics that is symmetric along the first axis", "--no-mirror"),
         (config.compression > 0, "matter that resists compression", "--compression 0"),
     ):
         if assumed:
             console.print(f"assuming {what}; {option} if that is wrong", highlight=False)
-
-
-def run_folder(config: TrainConfig) -> Path:
-    """Where the run's files go. A new run never goes where another one is."""
-    if config.resume is not None:
-        return config.resume
-    if config.out is not None:
-        if (config.out / LAST).exists():
-            raise ValueError(
-                f"--out: {config.out} holds a run already; go on with it (--resume {config.out}) "
-                "or name another folder"
+    for name, value, what, stds in (
+        ("noise", config.noise, "velocity's", metadata.velocity_std),
+        ("drift", config.drift, "acceleration's", metadata.acceleration_std),
+    ):
+        std = float(np.mean(stds))
+        if value and not NOISE[0] <= value / std <= NOISE[1]:
+            console.print(
+                f"warning: {name} is {value:g}, {value / std:.2g} times the {what} standard "
+                f"deviation per frame in these data; usual is a tenth to a third, "
+                f"--{name} {0.1 * std:.1g} to {std / 3:.1g}",
+                highlight=False,
             )
-        return config.out
+
+
+@contextmanager
+def run_folder(config: TrainConfig) -> Iterator[Path]:
+    """Where the run's files go, which no other training writes to meanwhile. A new run never goes
+    where another one is."""
+    named = config.resume or config.out
+    if named is not None:
+        with _locked(named) as own:
+            if not own:
+                raise ValueError(f"{named}: another training is at work there; name another folder")
+            if config.resume is None and (named / LAST).exists():
+                raise ValueError(
+                    f"--out: {named} holds a run already; go on with it (--resume {named}) "
+                    "or name another folder"
+                )
+            yield named
+        return
     network = "gns" if config.model.edges else "mlp"
     name = f"{Path(config.data).name}-{config.preset}-{network}-{config.loss}-{config.seed}"
-    folder = Path("runs") / name
-    taken = 1
-    while (folder / LAST).exists():
-        taken += 1
-        folder = Path("runs") / f"{name}-{taken}"
-    return folder
+    for number in count(1):
+        folder = Path("runs") / (name if number == 1 else f"{name}-{number}")
+        if (folder / LAST).exists():
+            continue
+        with _locked(folder) as own:
+            if own and not (folder / LAST).exists():
+                yield folder
+                return
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[bool]:
+    """Whether ``folder`` is this process's own meanwhile: no longer than the process lives, however
+    it ends. A folder into which nothing was written does not stay."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock, own = FileLock(folder / LOCK), True
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        own = False
+    except NotImplementedError:  # a file system without locks
+        pass
+    try:
+        yield own
+    finally:
+        if own and [each.name for each in folder.iterdir()] == [LOCK]:
+            (folder / LOCK).unlink()
+            folder.rmdir()
+        lock.release()
 
 
 def report(folder: Path, data: Path, config: TrainConfig, console: Console) -> None:

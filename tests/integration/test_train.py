@@ -20,7 +20,7 @@ import torch
 from adaptgns.checkpoint import LAST, read_checkpoint
 from adaptgns.config import to_json
 from adaptgns.presets import PRESETS
-from adaptgns.train import main, parse
+from adaptgns.train import main, parse, run_folder
 
 
 def command(*arguments: object) -> list[str]:
@@ -61,7 +61,9 @@ def test_an_existing_run_is_not_overwritten(
     [
         (["--preset", "huge"], "--preset: got 'huge'; accepted are smoke, laptop, paper"),
         (["--data", "no/such/folder"], "no/such/folder"),
-        (["--resume", "no/such/run"], "not found"),
+        (["--resume", "no/such/run"], "no/such/run holds no last.safetensors"),
+        (["--resume", "sand", "--preset", "smoke"], "got smoke, sand; accepted is one of them"),
+        (["--config", __file__], "test_train.py: not readable as JSON"),
     ],
 )
 def test_wrong_arguments_are_named(
@@ -92,6 +94,53 @@ def test_a_run_is_resumed_with_what_its_weights_are_made_for(
         assert exit_.value.code == 2
         assert told in capsys.readouterr().err
     assert (tmp_path / "config.json").read_bytes() == saved
+
+
+def test_a_folder_belongs_to_one_training_at_a_time(
+    drops: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = replace(PRESETS["smoke"], data=str(drops))
+    with run_folder(config) as first, run_folder(config) as second:
+        assert second.name == f"{first.name}-2"
+        with (
+            pytest.raises(ValueError, match="another training is at work there"),
+            run_folder(replace(config, out=first)),
+        ):
+            pass
+        with (
+            pytest.raises(ValueError, match="another training is at work there"),
+            run_folder(replace(config, resume=second)),
+        ):
+            pass
+        (second / LAST).touch()
+    assert not first.exists(), "nothing was written there"
+    with run_folder(config) as again:
+        assert again == first
+        (again / LAST).touch()
+    with run_folder(config) as third:
+        assert third.name == f"{first.name}-3"
+    with run_folder(replace(config, resume=second)) as resumed:
+        assert resumed == second
+
+
+def test_a_run_goes_on_in_its_own_folder(drops: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    main(["--preset", "smoke", "--data", str(drops), "--out", str(run), "--steps", "2"])
+    with pytest.raises(ValueError, match=r"--out: got elsewhere beside --resume"):
+        parse(["--resume", str(run), "--out", "elsewhere"])
+
+
+def test_what_is_unusual_about_the_data_is_said(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Noise of another unit, and short trajectories, which are measured at their last step."""
+    arguments = ["--preset", "smoke", "--data", str(drops), "--steps", "2", "--test-horizon", "9"]
+    main([*arguments, "--out", str(tmp_path / "one"), "--noise", "1", "--drift", "0"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "warning: noise is 1, " in told
+    assert "drift is" not in told
+    assert "MSE@9" in told
 
 
 def test_damaged_test_data_is_told_before_training(

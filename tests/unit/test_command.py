@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+import warnings
 from pathlib import Path
 
 import pytest
 
 from adaptgns.command import plain_errors
+from adaptgns.data import DataWarning
 
 
 @pytest.mark.parametrize(
@@ -27,6 +29,18 @@ def test_plain_errors(
         raise error
     assert exit_.value.code == code
     assert capsys.readouterr().err == told
+
+
+def test_what_is_suspicious_about_data_is_a_line() -> None:
+    def shown(category: type[Warning]) -> str:
+        return warnings.formatwarning("train.h5: odd", category, "train.py", 129)
+
+    with plain_errors():
+        assert shown(DataWarning) == "warning: train.h5: odd\n"
+        assert shown(DeprecationWarning).startswith(
+            "train.py:129: DeprecationWarning: train.h5: odd"
+        )
+    assert shown(DataWarning).startswith("train.py:129: DataWarning: train.h5: odd")
 
 
 def test_bugs_keep_their_traceback() -> None:

@@ -588,3 +588,28 @@ def test_write_dataset_refuses(tmp_path: Path) -> None:
     assert metadata == read_metadata(tmp_path / "out")
     with pytest.raises(DataError, match="out: exists; choose another name"):
         write_dataset(tmp_path / "out", {"train": trajectories()}, **fine)
+
+
+def test_write_dataset_takes_numbers_of_numpy(tmp_path: Path) -> None:
+    metadata = write_dataset(
+        tmp_path / "out",
+        {"train": trajectories()},
+        dt=np.float32(0.5),  # type: ignore[arg-type]
+        bounds=np.array([[0.0, 1.0]] * 2),  # type: ignore[arg-type]
+        radius=np.float32(0.5),  # type: ignore[arg-type]
+        periodic=np.array([True, False]),  # type: ignore[arg-type]
+        kinematic_types=np.array([3, 4]),  # type: ignore[arg-type]
+    )
+    assert (metadata.dt, metadata.radius, metadata.periodic) == (0.5, 0.5, (True, False))
+    assert metadata.kinematic_types == (3, 4)
+
+
+def test_splits_have_the_same_material_properties(tmp_path: Path) -> None:
+    other = [
+        replace(each, material_property=np.ones((each.positions.shape[1], 2), np.float32))
+        for each in trajectories()
+    ]
+    with pytest.raises(DataError, match="material properties: train has 0, test has 2; the same"):
+        write_dataset(tmp_path / "out", {"train": trajectories(), "test": other}, dt=1.0,
+                      bounds=[(0, 1)] * 2, radius=0.1)  # fmt: skip
+    assert list(tmp_path.iterdir()) == []

@@ -89,6 +89,28 @@ def test_marks_past_the_end_are_told(tmp_path: Path, metadata: Metadata) -> None
     assert row.split()[2:5] == ["2.50e-05", "–", "–"]
 
 
+def test_short_rollouts_are_measured_at_their_last_step(tmp_path: Path, metadata: Metadata) -> None:
+    file = write_rollout(tmp_path / "short.h5", metadata, steps=12)
+    report = measure([file])
+    assert (report.marks, report.notes) == ([12], [])
+    assert report.rollouts[0].mean("mse@12") is not None
+    assert measure([file], [50]).marks == [50]
+
+
+def test_why_a_mean_is_missing_is_told(
+    tmp_path: Path, metadata: Metadata, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("adaptgns.evaluate.MATCHED", 10)
+    lonely = replace(metadata, radius=1e-6)
+    report = measure([write_rollout(tmp_path / "short.h5", lonely)], [5])
+    names = ", ".join(report.trajectories)
+    assert report.notes == [
+        f"no mean clumping@5, for want of one of trajectory {names}: no true edges there",
+        f"no mean transport@5, for want of one of trajectory {names}: more than 10 particles to "
+        "match",
+    ]
+
+
 def test_json_is_strict_and_whole(tmp_path: Path, metadata: Metadata) -> None:
     path = write_rollout(tmp_path / "r.h5", metadata)
     with h5py.File(path, "r+") as file:

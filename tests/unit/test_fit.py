@@ -8,7 +8,7 @@ import os
 import signal
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -118,6 +118,29 @@ def test_metrics_best_checkpoint_and_log_after_a_resume(
     assert read_checkpoint(tmp_path / LAST).types == (3, 5), "of what came before, too"
     assert [e["step"] for e in log(tmp_path)] == [6, 12, 12, 14, 14]
     assert any((tmp_path / "tensorboard").iterdir())
+
+
+def test_among_the_settled_only_a_better_one_is_best(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also at a last step that is no multiple of the steps between validations."""
+    scores, validate = iter([5.0, 1.0, 3.0, 4.0]), fit.validate
+
+    def scored(*arguments: Any) -> Any:
+        validation = validate(*arguments)
+        better = {**validation.scores, "valid_rollout_mse": next(scores)}
+        return replace(validation, scores=better)
+
+    monkeypatch.setattr(fit, "validate", scored)
+    trainer(drops, tmp_path, replace(small_config, steps=10, validate_every=3)).run(QUIET)
+    best = read_checkpoint(tmp_path / BEST)
+    assert (best.step, best.best_score) == (9, 3.0), "of those at 9 and 10, not at 3 and 6"
+
+
+def test_a_broken_log_is_named(drops: Path, tmp_path: Path, small_config: TrainConfig) -> None:
+    (tmp_path / "metrics.jsonl").write_text('{"step": 1}\nnothing\n')
+    with pytest.raises(ValueError, match=r"metrics\.jsonl: line 2 is no JSON object"):
+        trainer(drops, tmp_path, small_config).run(QUIET)
 
 
 def test_a_loss_that_is_not_finite_stops_with_what_to_look_at(

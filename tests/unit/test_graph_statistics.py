@@ -39,7 +39,7 @@ def test_equals_networkx(
     box = np.array([1.0, np.inf, 1.0][:dim]) if periodic else None
     graph = reference(positions, radius, box)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_WEDGES_AT_A_TIME", wedges)
+        patch.setattr(module, "_PATHS_AT_A_TIME", wedges)
         statistics = graph_statistics(positions, radius, box)
     assert statistics.nodes == particles
     assert statistics.edges == graph.number_of_edges()
@@ -53,3 +53,16 @@ def test_too_few_particles_for_an_edge(particles: int) -> None:
     statistics = graph_statistics(np.zeros((particles, 2), np.float32), 0.1)
     assert (statistics.nodes, statistics.edges) == (particles, 0)
     assert statistics.density == statistics.degree == statistics.clustering == 0
+
+
+def test_of_a_dense_graph_some_particles_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    positions = np.random.default_rng(0).random((900, 2))
+    graph = reference(positions, 0.1, None)
+    paths = sum(degree**2 for _, degree in graph.degree)
+    monkeypatch.setattr(module, "_PATHS", paths // 3)
+    whole = nx.average_clustering(graph)
+    assert graph_statistics(positions, 0.1).clustering == pytest.approx(whole, rel=0.02)
+    assert graph_statistics(positions, 0.1).clustering != whole
+    assert nx.average_clustering(graph, nodes=range(0, 900, 4)) == pytest.approx(
+        graph_statistics(positions, 0.1).clustering
+    )

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from adaptgns.data import open_split
+from adaptgns.data import DataError, open_split, read_metadata
 from adaptgns.graph_statistics import graph_statistics
 from adaptgns.inspect import main
 
@@ -60,13 +60,37 @@ def test_a_radius_far_off_is_a_problem(
     assert ("warning: radius: r = " in told) == far_off
 
 
+@pytest.mark.parametrize("asked", [None, "0.03"])
+def test_without_a_radius_one_is_proposed(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], asked: str | None
+) -> None:
+    shutil.copytree(drops, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "metadata.json"
+    content = json.loads(path.read_text())
+    del content["default_connectivity_radius"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(
+        DataError, match=r"no default_connectivity_radius; .*inspect .* proposes one"
+    ):
+        read_metadata(tmp_path)
+    with pytest.raises(SystemExit) as left:
+        main([str(tmp_path), "--frame", "20", *([] if asked is None else ["--radius", asked])])
+    assert left.value.code == 1
+    told = capsys.readouterr().out
+    used = re.search(r"no default_connectivity_radius; here it is (0\.\d+)", told)
+    advised = re.search(r"radius: r = (0\.\d+) gives 6 neighbours on average", told)
+    assert used is not None
+    assert advised is not None
+    assert used[1] == (asked or advised[1])
+
+
 def test_a_missing_valid_split_is_a_problem(
     drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for path in drops.iterdir():
         if path.stem != "valid":
             shutil.copy(path, tmp_path)
-    assert "a train split, but no valid" in report(capsys, str(tmp_path))
+    assert "train, but no valid split" in report(capsys, str(tmp_path))
 
 
 def test_narrow_terminals(
@@ -112,12 +136,13 @@ def test_problems_are_all_told(spoiled: Path, capsys: pytest.CaptureFixture[str]
     assert ended.value.code == 1
     told = capsys.readouterr().out
     problems = told[told.index("problems: ") :].splitlines()
-    assert problems[0] == "problems: 4"
+    assert problems[0] == "problems: 5"
     expected = (
         r"error: .*valid\.npz: not a readable npz",
-        r"warning: .*metadata\.json: vel_std is 0\.01 0\.001, but 0\.00\d+ 0\.00\d+ in train\.h5",
+        r"warning: .*train\.h5: vel_std is 0\.01 0\.001 in metadata\.json, but 0\.00\d+ 0\.00\d+",
         r"error: .*test\.h5: trajectory 00000: frame 11: particle 4 is at \[nan, nan\]",
         r"warning: .*test\.h5: 1 of .* first trajectory 00001: frame 3: particle 7",
+        r"warning: .*test\.h5: trajectory 00001: frame [34]: particle 7 is .* 5\.\d radii",
     )
     for pattern in expected:
         assert sum(re.search(pattern, line) is not None for line in problems) == 1, pattern

@@ -368,6 +368,18 @@ def test_a_horizon_behind_the_end_of_the_data_is_told(
         assert ends == told
 
 
+def test_more_neighbours_than_particles_are_refused_at_once(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "r.h5"
+    options = ["--checkpoint", "waterdrop", "--data", str(drops), "--policy", "knn", "--k", "500"]
+    with pytest.raises(SystemExit):
+        main([*options, "--out", str(out)])
+    told = capsys.readouterr().err
+    assert re.search(r"k: got 500; trajectory \d+ of .*test\.h5 has \d+ particles", told)
+    assert not out.exists()
+
+
 def test_a_file_that_is_there_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rollout.h5"
     out.write_bytes(b"dear")

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -207,6 +208,9 @@ def test_nothing_unreadable_is_written(
         write_split(tmp_path / "test.h5", [trajectory(), bad])
     with pytest.raises(DataError, match="trajectory 00000: 3 frames"):
         write_split(tmp_path / "test.h5", [trajectory(3)])
+    frame = replace(trajectory(), positions=trajectory().positions[0])
+    with pytest.raises(DataError, match=r"positions have the shape \[\d+, 2\]; \[T, N, d\]"):
+        write_split(tmp_path / "test.h5", [frame])
     assert list(tmp_path.iterdir()) == []
 
 

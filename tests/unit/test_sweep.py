@@ -124,6 +124,11 @@ def test_samplers_that_draw_stay_within_the_ranges(config: SweepConfig, sampler:
     assert len({row["factor"] for row in trials}) == 3
 
 
+def test_a_value_named_twice_is_refused(config: SweepConfig) -> None:
+    with pytest.raises(ValueError, match=r"tau: got 50\.0, 50\.0; each value is accepted once"):
+        replace(config, tau=(50.0, 50.0))
+
+
 def test_the_command(config: SweepConfig, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--checkpoint", str(config.checkpoint), "--out", str(config.out)]
     main([*arguments, "--tau", "70", "--factor", "1.2", "--steps", "4"])

@@ -9,15 +9,28 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from adaptgns.data.errors import DataError, DataWarning
+from adaptgns.data.statistics import FILE_KEYS, MotionAccumulator
+from adaptgns.data.trajectories import SPELLINGS
+from adaptgns.periodic import minimum_image
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from adaptgns.data.metadata import Metadata
     from adaptgns.data.trajectories import Trajectories
+    from adaptgns.data.trajectory import Trajectory
 
 _BLOCK_VALUES = 1 << 18
 """Numbers looked at together, so that a trajectory of any length fits."""
+
+_FAR = 3.0
+"""Radii in one frame, from which on a particle seems to have jumped."""
+
+_DROWNED = 10.0
+"""Spacings of 32-bit numbers that the displacements' standard deviation should have at least."""
+
+_SUSPICIOUS = 2.0
+"""Stored and computed standard deviations further apart than this factor are told."""
 
 _TOLERANCE = 1e-6
 """Of the extent: float32 positions clamped to a wall may lie this much beyond its decimal."""
@@ -43,10 +56,11 @@ def check_split(trajectories: Trajectories, metadata: Metadata) -> tuple[int, ..
         The particle types that occur, ascending.
 
     Raises:
-        DataError: a trajectory is damaged or not finite.
+        DataError: a trajectory is damaged, not finite, or all kinematic; or the split has other
+            material properties than the metadata.
 
     Warns:
-        DataWarning: particles lie outside the bounds.
+        DataWarning: what makes them suspicious.
     """
     types: set[int] = set()
     for problem in find_problems(trajectories, metadata, types):
@@ -59,23 +73,122 @@ def check_split(trajectories: Trajectories, metadata: Metadata) -> tuple[int, ..
 def find_problems(
     trajectories: Trajectories, metadata: Metadata, types: set[int] | None = None
 ) -> Iterator[Problem]:
-    """All that `check_split` would tell: one problem per unusable trajectory, then one for the
-    particles outside the bounds, with their number and the first of them. The particle types that
-    occur are added to `types`."""
-    outside = _Outside(metadata)
+    """All that `check_split` would tell: one problem per unusable trajectory, then one for each
+    kind of thing that is suspicious. The particle types that occur are added to `types`."""
+    path = trajectories.path
+    if trajectories.material_properties != metadata.material_properties:
+        yield Problem(
+            f"{path}: particles have {trajectories.material_properties} material properties, where "
+            f"those of the training data have {metadata.material_properties}",
+            fatal=True,
+        )
+        return
+    outside, motion = _Outside(metadata), _Motion(metadata, train=path.stem in SPELLINGS["train"])
     for index, frames in enumerate(trajectories.lengths.tolist()):
         values = int(trajectories.particle_counts[index]) * trajectories.dim
         step = max(_BLOCK_VALUES // values, 1)
         try:
             for start in range(0, frames, step):
-                block = trajectories.window(index, start, min(start + step, frames))
-                outside.look_at(block.name, start, block.positions, block.particle_type)
+                # Two frames more, for the displacements and their differences.
+                block = trajectories.window(index, start, min(start + step + 2, frames))
+                if not metadata.mobile(block.particle_type).any():
+                    kinematic = ", ".join(map(str, metadata.kinematic_types))
+                    raise DataError(
+                        f"{path}: trajectory {block.name}: all particles are kinematic (type "
+                        f"{kinematic}), so that there is nothing to predict"
+                    )
+                outside.look_at(block.name, start, block.positions[:step], block.particle_type)
+                motion.look_at(start, block)
                 if types is not None and start == 0:
                     types.update(np.unique(block.particle_type).tolist())
         except DataError as error:
             yield Problem(str(error), fatal=True)
-    if outside.count:
-        yield Problem(f"{trajectories.path}: {outside}", fatal=False)
+    suspicions = [*([str(outside)] if outside.count else []), *motion.suspicions()]
+    for suspicion in suspicions:
+        yield Problem(f"{path}: {suspicion}", fatal=False)
+
+
+class _Motion:
+    """Looks at how particles move that aren't kinematic."""
+
+    def __init__(self, metadata: Metadata, *, train: bool) -> None:
+        self._metadata = metadata
+        self._statistics: MotionAccumulator | None = None
+        if train:
+            self._statistics = MotionAccumulator(
+                metadata.dim, box=metadata.box, kinematic_types=metadata.kinematic_types
+            )
+        self._farthest = 0.0
+        self._where = ""
+        self._largest = 0.0
+        self._moving: set[int] = set()
+        self._types: set[int] = set()
+
+    def look_at(self, start: int, block: Trajectory) -> None:
+        """Takes in frames from `start` on, of which the first two may have been the last of those
+        before."""
+        self._largest = max(self._largest, float(np.abs(block.positions).max()))
+        mobile = self._metadata.mobile(block.particle_type)
+        types = block.particle_type[mobile]
+        self._types.update(np.unique(types).tolist())
+        if len(block.positions) < 2:
+            return
+        displacement = minimum_image(
+            np.diff(block.positions[:, mobile], axis=0), self._metadata.box
+        )
+        squared = np.square(displacement).sum(axis=-1)
+        frame, particle = np.unravel_index(np.argmax(squared), squared.shape)
+        if (length := float(np.sqrt(squared[frame, particle]))) > self._farthest:
+            self._farthest = length
+            number = int(np.flatnonzero(mobile)[particle])
+            self._where = f"trajectory {block.name}: frame {start + frame + 1}: particle {number}"
+        self._moving.update(np.unique(types[squared.any(axis=0)]).tolist())
+        if self._statistics is not None and len(block.positions) > 2:
+            self._statistics.add(block.positions, block.particle_type, continues=start > 0)
+
+    def suspicions(self) -> Iterator[str]:
+        """What is suspicious in all that was taken in."""
+        metadata = self._metadata
+        if self._farthest > _FAR * metadata.radius:
+            yield (
+                f"{self._where} is {self._farthest:.3g} from where it was a frame before, "
+                f"{self._farthest / metadata.radius:.1f} radii; about one at most is usual. Is an "
+                "axis periodic (periodic_boundary_conditions), or are frames too far apart?"
+            )
+        still = sorted(self._types - self._moving)
+        if still and self._moving:
+            kinematic = ", ".join(map(str, metadata.kinematic_types)) or "none"
+            yield (
+                f"particles of type {', '.join(map(str, still))} never move, but kinematic are "
+                f"those of type {kinematic}; if they are obstacles, metadata.json should say so "
+                "(kinematic_types)"
+            )
+        spacing = float(np.spacing(np.float32(self._largest)))
+        if min(metadata.velocity_std) < _DROWNED * spacing:
+            yield (
+                f"positions reach {self._largest:.6g}, where 32-bit numbers are {spacing:.2g} "
+                "apart; the displacements per frame, of a standard deviation of "
+                f"{min(metadata.velocity_std):.2g}, are little but rounding. Put the origin nearer"
+            )
+        yield from self._stale()
+
+    def _stale(self) -> Iterator[str]:
+        """Standard deviations that are not those of the train split."""
+        try:
+            found = None if self._statistics is None else self._statistics.finish()
+        except DataError:
+            return  # nothing to compare with
+        for name, key in FILE_KEYS.items():
+            if found is None or not name.endswith("_std"):
+                continue
+            stored, own = np.array(getattr(self._metadata, name)), np.array(getattr(found, name))
+            with np.errstate(divide="ignore"):
+                apart = np.abs(np.log(stored / own)).max()
+            if apart > np.log(_SUSPICIOUS):
+                yield (
+                    f"{key} is {_vector(stored)} in metadata.json, but {_vector(own)} here (in "
+                    "length per frame); without the key it is computed anew"
+                )
 
 
 class _Outside:
@@ -127,3 +240,7 @@ class _Outside:
             f"trajectories, lie outside the bounds {bounds} by up to {self._farthest:.2g}; first "
             f"{self._first}"
         )
+
+
+def _vector(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
+    return " ".join(f"{value:.3g}" for value in values)

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from adaptgns.atomic import folder_written_whole
 from adaptgns.data.errors import DataError
-from adaptgns.data.metadata import GNS_KINEMATIC, Metadata, read_metadata, write_metadata
+from adaptgns.data.metadata import (
+    GNS_KINEMATIC,
+    RADIUS_KEY,
+    Metadata,
+    read_metadata,
+    write_metadata,
+)
 from adaptgns.data.store import write_split
 from adaptgns.data.trajectories import SPLITS, find_split, open_split
 
@@ -56,12 +62,14 @@ def write_dataset(
     refuse_taken(folder)
     content: dict[str, Any] = {
         "dim": len(bounds),
-        "dt": dt,
+        "dt": float(dt),
         "write_every": 1,
         "bounds": [list(map(float, axis)) for axis in bounds],
-        "periodic_boundary_conditions": [False] * len(bounds) if periodic is None else [*periodic],
-        "kinematic_types": [*kinematic_types],
-        "default_connectivity_radius": radius,
+        "periodic_boundary_conditions": [False] * len(bounds)
+        if periodic is None
+        else [bool(axis) for axis in periodic],
+        "kinematic_types": [int(kind) for kind in kinematic_types],
+        RADIUS_KEY: float(radius),
     }
     with folder_written_whole(folder) as partial:
         try:
@@ -83,9 +91,16 @@ def refuse_taken(path: Path) -> None:
 def counts(folder: Path) -> dict[str, Any]:
     """What LagrangeBench wants to know of the splits in `folder`, under its names."""
     found = {split: open_split(folder, split) for split in SPLITS if find_split(folder, split)}
+    material = {name: split.material_properties for name, split in found.items()}
+    if len(set(material.values())) > 1:
+        raise DataError(
+            "material properties: "
+            + ", ".join(f"{name} has {number}" for name, number in material.items())
+            + "; the same number in all splits is accepted"
+        )
     content: dict[str, Any] = {
         "num_particles_max": max(int(split.particle_counts.max()) for split in found.values()),
-        "material_properties": next(iter(found.values())).material_properties,
+        "material_properties": next(iter(material.values())),
     }
     for name, split in found.items():
         content[f"sequence_length_{name}"] = int(split.lengths.max())

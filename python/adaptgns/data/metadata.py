@@ -18,6 +18,7 @@ from adaptgns.data.statistics import FILE_KEYS, MotionStatistics, compute_statis
 from adaptgns.data.trajectories import SPLITS, find_split, open_split
 
 FILE_NAME = "metadata.json"
+RADIUS_KEY = "default_connectivity_radius"
 
 GNS_KINEMATIC = (3,)
 LAGRANGEBENCH_KINEMATIC = (1, 2)
@@ -111,12 +112,12 @@ class Metadata:
         return cls(**{name: _frozen(value) for name, value in content.items()})
 
 
-def read_metadata(folder: Path) -> Metadata:
+def read_metadata(folder: Path, *, radius: float | None = None) -> Metadata:
     """Reads `metadata.json` of GNS, LagrangeBench or this project.
 
     GNS files split into a `train` and a `rollout` section are understood. Missing statistics are
     computed from the train split and written back; where the file can't be written they are kept
-    in memory and a `DataWarning` says so.
+    in memory and a `DataWarning` says so. `radius` stands for one that the file doesn't state.
 
     Raises:
         DataError: no such file, not JSON, or missing or impossible values; names file and key.
@@ -126,13 +127,20 @@ def read_metadata(folder: Path) -> Metadata:
     content = _load(path)
     section = training_section(content)
     try:
-        metadata = _parse(section, folder)
+        metadata = _parse(section if radius is None else {RADIUS_KEY: radius, **section}, folder)
     except DataError as error:
+        if str(error).startswith(str(folder)):  # it is about another file
+            raise
         raise DataError(f"{path}: {error}") from error
     missing = [key for key in FILE_KEYS.values() if key not in section]
     if missing:
         _write_back(path, content, metadata)
     return metadata
+
+
+def states_radius(folder: Path) -> bool:
+    """Whether `metadata.json` in `folder` states a connectivity radius."""
+    return RADIUS_KEY in training_section(_load(folder / FILE_NAME))
 
 
 def write_metadata(folder: Path, content: dict[str, Any]) -> None:
@@ -180,7 +188,10 @@ def _setting(section: dict[str, Any], folder: Path) -> dict[str, Any]:
     dt = _number(section, "dt") * (
         _number(section, "write_every") if "write_every" in section else 1.0
     )
-    radius = _number(section, "default_connectivity_radius")
+    try:
+        radius = _number(section, RADIUS_KEY)
+    except DataError as error:
+        raise DataError(f"{error}; `python -m adaptgns.inspect {folder}` proposes one") from None
     _check_geometry(dim, dt, bounds, periodic, radius)
     return {
         "dim": dim,
@@ -288,7 +299,7 @@ def _check_geometry(
         raise DataError(
             f"periodic_boundary_conditions is {list(periodic)}; {dim} booleans are accepted"
         )
-    for name, value in (("dt", dt), ("default_connectivity_radius", radius)):
+    for name, value in (("dt", dt), (RADIUS_KEY, radius)):
         if not (math.isfinite(value) and value > 0):
             raise DataError(f"{name} is {value}; a finite number above 0 is accepted")
 

@@ -63,6 +63,21 @@ class DegreeCurve:
         return float(self._distances[self._wanted - 1]) if self._reachable else None
 
 
+def advise_radius(
+    frames: Sequence[npt.NDArray[np.float32]], box: npt.NDArray[np.float64] | None
+) -> float | None:
+    """The radius with the mean degree aimed at over `frames` `[N, d]`; None with too few particles
+    for it, or none of them apart."""
+    spread = [np.ptp(positions, axis=0).astype(np.float64) for positions in frames]
+    spacing = [
+        float(np.prod(each) / len(positions)) ** (1 / len(each))
+        for each, positions in zip(spread, frames, strict=True)
+    ]
+    begin = min((each for each in spacing if each > 0), default=max(map(np.max, spread)))
+    advised = DegreeCurve(frames, float(begin), box).advice() if begin > 0 else None
+    return advised or None
+
+
 def _distances(
     positions: npt.NDArray[np.float32], radius: float, box: npt.NDArray[np.float64] | None
 ) -> npt.NDArray[np.float64]:

@@ -76,6 +76,11 @@ class StoreWriter:
         """
         group = f"{self._written:05d}"
         where = f"{self.path}: trajectory {group}"
+        if trajectory.positions.ndim != 3:
+            raise DataError(
+                f"{where}: positions have the shape {list(trajectory.positions.shape)}; "
+                "[T, N, d] is accepted"
+            )
         check_shape(Shape(group, *trajectory.positions.shape), where)
         check_finite(trajectory, 0, where)
         types = particle_types(trajectory.particle_type, trajectory.positions.shape[1], where)
