@@ -41,6 +41,8 @@ METRICS = "metrics.json"
 MARKS = (50, 100, 200)
 STATISTICS_STEP = 100
 """Step of the graph statistics, as in table 2 of the paper"""
+NAMED = 3
+"""Trajectories that a note names"""
 DECILES = 10
 MATCHED = 2_000
 """Particles up to which clouds are matched: a second for each pair of clouds"""
@@ -55,8 +57,8 @@ class EvaluateConfig:
     out: Path | None = None
     """Folder for metrics.json; None: that of the first rollout file."""
     steps: tuple[int, ...] = MARKS
-    """Predicted frames at which errors are reported; where all rollouts end before the first of
-    these defaults, the last step that they have in common is."""
+    """Predicted frames at which errors are reported; where no file reaches the first of these
+    defaults, the last step that all have."""
 
 
 def evaluate(
@@ -95,7 +97,8 @@ def measure(files: Sequence[Path], marks: Sequence[int] = MARKS) -> Report:
         names = [rollout.name for rollout in first]
         shortest = min(rollout.steps for file in opened for rollout in file)
         statistics_step = min(STATISTICS_STEP, shortest)
-        marks = [shortest] if tuple(asked) == MARKS and shortest < MARKS[0] else asked
+        reached = max(min(rollout.steps for rollout in file) for file in opened)
+        marks = [shortest] if tuple(asked) == MARKS and reached < MARKS[0] else asked
         truth_statistics: list[GraphStatistics] = []
         tallies = [Tally() for _ in opened]
         baselines: dict[str, Tally] = defaultdict(Tally)
@@ -382,9 +385,11 @@ def gap_notes(measures: Sequence[Measures], names: Sequence[str]) -> list[str]:
             kind = scalar.partition("@")[0]
             without = ~np.isfinite(values) & ~diverged
             if kind in reasons and without.any():
-                lacking = ", ".join(np.array(names)[without])
-                notes[scalar, lacking] = (
-                    f"no mean {scalar}, for want of one of trajectory {lacking}: {reasons[kind]}"
+                some = ", ".join(np.array(names)[without][:NAMED])
+                more = int(without.sum()) - NAMED
+                notes[scalar, some] = (
+                    f"no mean {scalar}, for want of one of trajectory {some}"
+                    f"{f' and {more} more' if more > 0 else ''}: {reasons[kind]}"
                 )
     return list(notes.values())
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
 import tyro
-from filelock import FileLock, Timeout
 from rich.console import Console
 
 from adaptgns.atomic import replace_text
@@ -40,6 +39,11 @@ from adaptgns.processes import OtherEndedError, Processes, processes
 from adaptgns.rollout import write_rollouts
 from adaptgns.threads import divide_threads
 
+try:
+    import fcntl
+except ImportError:
+    fcntl = None  # type: ignore[assignment]
+
 CONFIG = "config.json"
 LOCK = ".lock"
 NOISE = (0.02, 2.0)
@@ -49,12 +53,13 @@ NOISE = (0.02, 2.0)
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command with ``argv``, or with the process's own arguments."""
     console = Console()
-    with plain_errors(torch.OutOfMemoryError, OtherEndedError):
+    with plain_errors(torch.OutOfMemoryError, OtherEndedError), ExitStack() as held:
         config = parse(sys.argv[1:] if argv is None else list(argv))
         with processes(config.device) as group:
             own = console if group.first else Console(quiet=True)
             try:
-                folder, data = train(config, own, group)
+                folder = group.same(lambda: held.enter_context(run_folder(config)))
+                data = train(config, folder, own, group)
             except TrainingStopped as stopped:
                 if group.first:
                     console.print(str(stopped), markup=False)
@@ -144,23 +149,10 @@ def _take(arguments: list[str], option: str) -> tuple[str | None, list[str]]:
     return None, arguments
 
 
-def train(config: TrainConfig, console: Console, group: Processes) -> tuple[Path, Path]:
-    """Train by ``config``, as one of the processes of ``group``; the run folder and that of the
-    data."""
-    checkpoint = None if config.resume is None else _last_checkpoint(config.resume)
-    with ExitStack() as held:
-        folder = group.same(lambda: held.enter_context(run_folder(config)))
-        return folder, _train(config, folder, checkpoint, console, group)
-
-
-def _train(
-    config: TrainConfig,
-    folder: Path,
-    checkpoint: Checkpoint | None,
-    console: Console,
-    group: Processes,
-) -> Path:
-    """Train in ``folder``, from ``checkpoint`` if there is one; the data's folder."""
+def train(config: TrainConfig, folder: Path, console: Console, group: Processes) -> Path:
+    """Train by ``config`` in ``folder`` (:func:`run_folder`), as one of the processes of ``group``;
+    the data's folder."""
+    checkpoint = None if config.resume is None else _last_checkpoint(folder)
     threads = config.threads or torch.get_num_threads()
     if torch_device(config.device).type == "cpu":
         divide_threads(threads)
@@ -177,8 +169,9 @@ def _train(
         train_split, valid_split, test_split = (
             open_split(data, split) for split in ("train", "valid", "test")
         )
-        # Before anything depends on them.
-        types, *_ = (check_split(s, metadata) for s in (train_split, valid_split, test_split))
+        types = None
+        if group.first:  # before anything depends on them; the others need not look again
+            types, *_ = (check_split(s, metadata) for s in (train_split, valid_split, test_split))
         trainer = Trainer(
             config,
             metadata,
@@ -221,7 +214,7 @@ def _tell_assumptions(config: TrainConfig, metadata: Metadata, console: Console)
         if value and not NOISE[0] <= value / std <= NOISE[1]:
             console.print(
                 f"warning: {name} is {value:g}, {value / std:.2g} times the {what} standard "
-                f"deviation per frame in these data; usual is a tenth to a third, "
+                "deviation in these data; usual is a tenth to a third, "
                 f"--{name} {0.1 * std:.1g} to {std / 3:.1g}",
                 highlight=False,
             )
@@ -235,7 +228,10 @@ def run_folder(config: TrainConfig) -> Iterator[Path]:
     if named is not None:
         with _locked(named) as own:
             if not own:
-                raise ValueError(f"{named}: another training is at work there; name another folder")
+                instead = "wait for it" if config.resume else "name another folder"
+                raise ValueError(
+                    f"{named}: another training is at work there; {instead}, or end it"
+                )
             if config.resume is None and (named / LAST).exists():
                 raise ValueError(
                     f"--out: {named} holds a run already; go on with it (--resume {named}) "
@@ -258,22 +254,32 @@ def run_folder(config: TrainConfig) -> Iterator[Path]:
 @contextmanager
 def _locked(folder: Path) -> Iterator[bool]:
     """Whether ``folder`` is this process's own meanwhile: no longer than the process lives, however
-    it ends. A folder into which nothing was written does not stay."""
+    it ends. What is made for it and holds nothing in the end does not stay."""
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    lock, own = FileLock(folder / LOCK), True
+    lock = folder / LOCK
     try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        own = False
-    except NotImplementedError:  # a file system without locks
-        pass
-    try:
-        yield own
+        with lock.open("a") as file:
+            yield _lock(file)
     finally:
-        if own and [each.name for each in folder.iterdir()] == [LOCK]:
-            (folder / LOCK).unlink()
-            folder.rmdir()
-        lock.release()
+        with suppress(OSError):
+            if folder in made and list(folder.iterdir()) == [lock]:
+                lock.unlink()
+                for each in made:
+                    each.rmdir()
+
+
+def _lock(file: IO[str]) -> bool:
+    """Whether no other process has locked ``file``, as far as the file system can tell."""
+    if fcntl is None:  # Windows
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError:  # a file system without locks
+        pass
+    return True
 
 
 def report(folder: Path, data: Path, config: TrainConfig, console: Console) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import random
 import shutil
@@ -122,6 +123,51 @@ def test_a_folder_belongs_to_one_training_at_a_time(
         assert third.name == f"{first.name}-3"
     with run_folder(replace(config, resume=second)) as resumed:
         assert resumed == second
+
+
+@pytest.mark.parametrize("during", ["run", "report"])
+def test_a_folder_belongs_to_a_training_until_it_has_reported(
+    drops: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, during: str
+) -> None:
+    run = tmp_path / "run"
+    told = []
+
+    def meanwhile(*_: object) -> None:
+        other = command("--preset", "smoke", "--data", drops, "--out", run)
+        told.append(subprocess.run(other, capture_output=True, text=True, check=False).stderr)
+
+    where = "adaptgns.fit.Trainer.run" if during == "run" else "adaptgns.train.report"
+    monkeypatch.setattr(where, meanwhile)
+    monkeypatch.setattr("adaptgns.train.report", meanwhile)
+    main(["--preset", "smoke", "--data", str(drops), "--out", str(run), "--steps", "1"])
+    assert len(told) == (2 if during == "run" else 1)
+    for each in told:
+        assert "another training is at work there" in each
+
+
+def test_only_what_was_made_in_vain_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own").mkdir()
+    (tmp_path / "link").symlink_to("own")
+    monkeypatch.chdir(tmp_path)
+    for out in ("own", "link", "new/one", None):
+        options = [] if out is None else ["--out", out]
+        with pytest.raises(SystemExit):
+            main(["--data", "no/such", *options])
+        assert "no/such" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "own"]
+
+
+def test_a_file_system_without_locks_is_no_obstacle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", without)
+    with run_folder(replace(PRESETS["smoke"], out=tmp_path / "run")) as folder:
+        assert folder.is_dir()
 
 
 def test_a_run_goes_on_in_its_own_folder(drops: Path, tmp_path: Path) -> None:

@@ -131,7 +131,10 @@ def test_rounding_that_drowns_the_motion_is_told(tmp_path: Path, metadata: Metad
     save(tmp_path / "valid.h5", drift() + 5e5)
     far = replace(metadata, bounds=((5e5, 5e5 + 1),) * 2, radius=1.0)
     (problem,) = problems_of(tmp_path, far)
-    assert "positions reach 500001, where 32-bit numbers are 0.031 apart" in problem
+    assert "positions reach 500001 along axis 0, where 32-bit numbers are 0.031 apart" in problem
+    save(tmp_path / "valid.h5", drift() * [1e3, 1] + [5e5, 0])  # as far, and as much farther a step
+    channel = {"bounds": ((5e5, 6e5), (0.0, 1.0)), "velocity_std": (2.0, 2e-3)}
+    assert not problems_of(tmp_path, replace(far, **channel, radius=1e3))
 
 
 @pytest.mark.usefixtures("block")
@@ -144,6 +147,12 @@ def test_statistics_of_other_data_are_told(tmp_path: Path, metadata: Metadata) -
     (problem,) = problems_of(tmp_path, stale, "train")
     assert "vel_std is 0.00" in problem
     assert "in metadata.json, but 0.00" in problem
+    flat = drift()
+    flat[..., 1] = 0.5
+    save(tmp_path / "train.h5", flat)
+    found = compute_statistics(open_split(tmp_path, "train"), box=None, kinematic_types=())
+    ones = {name: (getattr(found, name)[0], 1.0) for name in ("velocity_std", "acceleration_std")}
+    assert not problems_of(tmp_path, replace(metadata, **(vars(found) | ones)), "train")
 
 
 def test_a_trajectory_without_anything_to_predict_is_refused(

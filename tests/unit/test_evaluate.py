@@ -95,6 +95,11 @@ def test_short_rollouts_are_measured_at_their_last_step(tmp_path: Path, metadata
     assert (report.marks, report.notes) == ([12], [])
     assert report.rollouts[0].mean("mse@12") is not None
     assert measure([file], [50]).marks == [50]
+    longer = write_rollout(tmp_path / "long.h5", metadata, steps=60, label="long")
+    both = measure([file, longer])
+    assert both.marks == [50, 100, 200]
+    assert both.rollouts[1].mean("mse@50") is not None
+    assert "no figure at step 50, 100, 200 for" in both.notes[0]
 
 
 def test_why_a_mean_is_missing_is_told(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from adaptgns.data import DataError, open_split, read_metadata
+from adaptgns.data.radius import advise_radius
 from adaptgns.graph_statistics import graph_statistics
 from adaptgns.inspect import main
 
@@ -82,6 +83,19 @@ def test_without_a_radius_one_is_proposed(
     assert used is not None
     assert advised is not None
     assert used[1] == (asked or advised[1])
+
+
+def test_strays_and_flat_frames_do_not_spoil_the_advice() -> None:
+    even = np.random.default_rng(0).random((2000, 2)).astype(np.float32)
+    whole = advise_radius([even], None)
+    assert whole is not None
+    stray = np.concatenate([even, [[1e6, 0.0]]]).astype(np.float32)
+    assert advise_radius([stray], None) == pytest.approx(whole, rel=0.01)
+    flat = np.concatenate([even, np.full((2000, 1), 0.5, np.float32)], axis=1)
+    assert advise_radius([flat], None) == pytest.approx(3**0.5 * whole, rel=0.1)
+    assert advise_radius([even[:3]], None) is None
+    assert advise_radius([even[:1]], None) is None
+    assert advise_radius([np.zeros((50, 2), np.float32)], None) is None
 
 
 def test_a_missing_valid_split_is_a_problem(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import warnings
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -129,7 +130,7 @@ def read_metadata(folder: Path, *, radius: float | None = None) -> Metadata:
     try:
         metadata = _parse(section if radius is None else {RADIUS_KEY: radius, **section}, folder)
     except DataError as error:
-        if str(error).startswith(str(folder)):  # it is about another file
+        if str(error).startswith(f"{folder}{os.sep}"):  # it is about another file
             raise
         raise DataError(f"{path}: {error}") from error
     missing = [key for key in FILE_KEYS.values() if key not in section]
@@ -191,6 +192,8 @@ def _setting(section: dict[str, Any], folder: Path) -> dict[str, Any]:
     try:
         radius = _number(section, RADIUS_KEY)
     except DataError as error:
+        if RADIUS_KEY in section:
+            raise
         raise DataError(f"{error}; `python -m adaptgns.inspect {folder}` proposes one") from None
     _check_geometry(dim, dt, bounds, periodic, radius)
     return {

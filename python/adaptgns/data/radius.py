@@ -12,12 +12,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from adaptgns._core import radius_graph
 from adaptgns.periodic import minimum_image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+_SAMPLED = 256
+"""Particles of a frame that a radius to begin with is taken from."""
 
 NEIGHBOURS = {2: 6.0, 3: 18.0}
 """The mean degree to aim at, by dimension."""
@@ -68,14 +72,14 @@ def advise_radius(
 ) -> float | None:
     """The radius with the mean degree aimed at over `frames` `[N, d]`; None with too few particles
     for it, or none of them apart."""
-    spread = [np.ptp(positions, axis=0).astype(np.float64) for positions in frames]
-    spacing = [
-        float(np.prod(each) / len(positions)) ** (1 / len(each))
-        for each, positions in zip(spread, frames, strict=True)
-    ]
-    begin = min((each for each in spacing if each > 0), default=max(map(np.max, spread)))
-    advised = DegreeCurve(frames, float(begin), box).advice() if begin > 0 else None
-    return advised or None
+    # Begin where half of a few particles have as many: strays and gaps do not matter.
+    reaches = []
+    for positions in frames:
+        wanted = min(int(NEIGHBOURS[positions.shape[1]]) + 1, len(positions))
+        some = positions[:: -(-len(positions) // _SAMPLED)]
+        reaches.append(np.atleast_2d(cKDTree(positions).query(some, [wanted])[0]).ravel())
+    begin = float(np.median(np.concatenate(reaches)))
+    return DegreeCurve(frames, begin, box).advice() if begin > 0 else None
 
 
 def _distances(

@@ -72,7 +72,7 @@ from adaptgns.reproduce.profiles import (
 from adaptgns.rollout import Step, steps, write_rollouts
 from adaptgns.rollout_file import RolloutFile
 from adaptgns.sweep import RESULT, SweepConfig, sweep
-from adaptgns.train import train
+from adaptgns.train import run_folder, train
 
 Split = Literal["valid", "test", "long"]
 """What is rolled out: a part of the data, or the trajectories of the long rollouts"""
@@ -583,7 +583,8 @@ class Run:
         if (self.folder / LAST).exists():
             config = replace(config, resume=self.folder)
         console.print(f"{self.name}: training", highlight=False)
-        train(config, console, ALONE)
+        with run_folder(config) as folder:
+            train(config, folder, console, ALONE)
 
     def measured(
         self,
