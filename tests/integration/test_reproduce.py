@@ -419,7 +419,7 @@ def test_a_diverged_rollout_is_reported(study: ReproduceConfig) -> None:
         for row in tables(study)["rollouts-sand"]["rows"]
         if row["cells"][:2] == ["GNS, NLL", "two-pass"]
     )
-    assert row[3] == "–"
+    assert row[4] == "–"
     assert "nan" not in (folder(study) / "report.md").read_text()
 
 
@@ -649,6 +649,29 @@ def test_only_seeds_of_both_are_compared(made: ReproduceConfig) -> None:
     assert pair is not None
     assert [len(each.runs) for each in pair] == [2, 2]
     assert results.pair("waterdrop", ("beta-nll", "fixed"), ("nll", "fixed")) is None
+
+
+def test_only_trajectories_of_both_are_compared(made: ReproduceConfig) -> None:
+    results = Results(study_of(made))
+    key = ("waterdrop", "nll", "fixed")
+    few = results.series[key] = replace(results.series[key], first=1)
+    pair = results.pair("waterdrop", ("nll-400", "fixed"), ("nll", "fixed"))
+    assert pair is not None
+    assert (few.sample, [each.sample for each in pair]) == ("2 × 1", ["1 × 1", "1 × 1"])
+    longer = results.series["waterdrop", "nll-400", "fixed"]
+    assert longer.trajectories == 2
+    assert results.difference(*pair, "mse@10").mean == pytest.approx(
+        longer.scalar("mse@10")[0, 0] - few.scalar("mse@10")[0, 0]
+    )
+
+
+def test_models_trained_for_longer_are_rolled_out_over_the_whole_test_split() -> None:
+    laptop = PROFILES["laptop"]
+    for model in laptop.models:
+        count = None if model.share > 1 else 10
+        assert laptop.trajectories_of(model, "test") == count
+        assert laptop.trajectories_of(model, "valid") == 10
+        assert laptop.trajectories_of(model, "long") is None
 
 
 def test_every_machine_that_a_study_was_made_on_is_named(study: ReproduceConfig) -> None:

@@ -85,7 +85,8 @@ def _rollout_steps(run: Run, split: Split) -> int:
         count, frames = plan.trajectories, plan.frames - HISTORY
     if long is not None:
         return count * frames
-    return min(count, profile.trajectories or count) * min(frames, profile.horizon or frames)
+    wanted = profile.trajectories_of(run.model, split)
+    return min(count, wanted or count) * min(frames, profile.horizon or frames)
 
 
 @lru_cache

@@ -235,7 +235,7 @@ def _pareto(results: Results, sets: list[DataSet]) -> Figure:
     for panels, data in zip(rows, sets, strict=True):
         for ax, unit in zip(panels, ("directed edges a step", "milliseconds a step"), strict=True):
             means: list[tuple[float, float]] = []
-            for series in results.of(data.name):
+            for series in results.alike(data.name):
                 model = series.model
                 if not model.edges or not model.prominent:
                     continue

@@ -64,6 +64,8 @@ class Model:
     policies: tuple[PolicyName, ...] = ("fixed",)
     chosen: Chosen | None = None
     """Of a model that is another one's training under a rule of its own"""
+    whole_test: bool = False
+    """Whether it is rolled out over all test trajectories, where the profile has fewer"""
 
     @property
     def length(self) -> str:
@@ -145,6 +147,7 @@ def longer(percent: int, budget: Model) -> tuple[Model, Model, Model]:
             name=f"{model.name}-{percent}",
             share=percent / 100,
             seeds=1,
+            whole_test=True,
             **settings,
         )
 
@@ -161,7 +164,7 @@ def on_water(models: Iterable[Model]) -> tuple[Model, ...]:
     return tuple(replace(model, sets=("waterdrop",)) for model in models)
 
 
-LONG = LONG_MSE, LONG_NLL, LONG_TUNED = longer(400, budget=NLL)  # which has fewer edges than MSE
+LONG = LONG_MSE, LONG_NLL, LONG_TUNED = longer(400, budget=NLL)  # which had fewer edges than MSE
 LONGEST = on_water(longer(800, budget=MSE))
 ADAPTIVE_NLL = replace(
     NLL,
@@ -177,6 +180,7 @@ LONG_NARROW = replace(
     radius=0.95,  # meant to have no more edges than fixed graphs of the data's radius
     share=4.0,
     seeds=1,
+    whole_test=True,
     policies=("fixed", "adaptive", "random", "base-sigma"),
 )
 TWO_SIDED_NLL = replace(
@@ -301,7 +305,7 @@ class Profile:
     marks: tuple[int, ...]
     """Steps at which errors are reported; the last one is that of the conclusions"""
     trajectories: int | None = None
-    """Test trajectories rolled out; None: all"""
+    """Trajectories of a split that are rolled out, the first ones; None: all"""
     horizon: int | None = None
     """Frames of the rollouts; None: to the end"""
     sweep: Sweep = Sweep()
@@ -318,6 +322,11 @@ class Profile:
     def seeds_of(self, model: Model) -> tuple[int, ...]:
         """Those that ``model`` is trained with."""
         return self.seeds[: model.seeds]
+
+    def trajectories_of(self, model: Model, split: str) -> int | None:
+        """How many of the split's trajectories ``model`` is rolled out over; None: all."""
+        whole = split == "long" or (split == "test" and model.whole_test)
+        return None if whole else self.trajectories
 
     def models_on(self, data: str) -> tuple[Model, ...]:
         """Those that are trained on the data set of that source."""

@@ -24,7 +24,8 @@ CAPTIONS = {
     "steps": "Figure 3: edges and errors at every step; bands reach from the lowest to the highest "
     "seed.",
     "pareto": "What the error costs, in edges and in time, with its 95 % interval; hollow: models "
-    "trained for longer; line: what no other model shown undercuts, in the mean. Times of another "
+    "trained for longer; line: what no other model shown undercuts, in the mean. Over the "
+    "trajectories that all were rolled out over. Times of another "
     "processor are left out.",
     "reliability": "Predicted and measured errors by deciles, a line for each seed.",
     "long": "Long rollouts: the error, and edges within the data's radius, predicted over true.",
@@ -75,7 +76,7 @@ def write_into(study: Study, readme: Path) -> None:
             kept = [
                 0,
                 1,
-                *range(2, 3 + len(study.profile.marks)),
+                *range(2, 4 + len(study.profile.marks)),
                 -3,
             ]  # the columns that say it; the report has them all
             rows = [
@@ -138,7 +139,7 @@ def _made(study: Study) -> str:
         f"Made with `python -m adaptgns.reproduce --preset {study.preset}` "
         f"{', and '.join(machines)}. "
         f"{len(profile.seeds)} seeds, {profile.base.steps:,} training steps, {count} test "
-        f"trajectories.{gate}"
+        f"trajectories, unless a row says otherwise.{gate}"
     )
 
 

@@ -83,6 +83,8 @@ class Series:
     policy: PolicyName
     runs: tuple[Run, ...]
     split: Split = "test"
+    first: int | None = None
+    """How many trajectories its scalars are of; None: all that were measured"""
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
@@ -92,6 +94,16 @@ class Series:
         if len(counts) > 1:
             raise StudyError(f"{self.files}: numbers of trajectories differ, {sorted(counts)}")
         return rows
+
+    @property
+    def trajectories(self) -> int:
+        """Of each run."""
+        return len(self.scalar("mse")[0])
+
+    @property
+    def sample(self) -> str:
+        """Seeds and trajectories that its means are over."""
+        return f"{len(self.runs)} × {self.trajectories}"
 
     @property
     def files(self) -> list[str]:
@@ -105,7 +117,7 @@ class Series:
         """``[seeds, trajectories]`` values, NaN where not finite or not measured."""
         missing = {"per_trajectory": [None] * len(self.rows[0]["scalars"]["mse"]["per_trajectory"])}
         values = [row["scalars"].get(name, missing)["per_trajectory"] for row in self.rows]
-        return np.array(values, dtype=np.float64)
+        return np.array(values, dtype=np.float64)[:, : self.first]
 
     def curve(self, name: str) -> NDArray[np.float64]:
         """``[seeds, K]`` values per step, means over trajectories."""
@@ -164,6 +176,12 @@ class Results:
         """Those of one data set."""
         return [series for (name, _, _), series in self.series.items() if name == data]
 
+    def alike(self, data: str) -> list[Series]:
+        """Those of one data set, on the trajectories that all have."""
+        own = self.of(data)
+        count = min(series.trajectories for series in own)
+        return [replace(series, first=count) for series in own]
+
     def find(self, data: str, model: str, policy: PolicyName) -> Series | None:
         """One of them; None where the profile has none."""
         return self.series.get((data, model, policy))
@@ -171,14 +189,19 @@ class Results:
     def pair(
         self, data: str, one: tuple[str, PolicyName], other: tuple[str, PolicyName]
     ) -> tuple[Series, Series] | None:
-        """Two models, each under a policy, with the seeds that both have; None where the profile
-        lacks one."""
+        """Two models, each under a policy, with the seeds and trajectories that both have; None
+        where the profile lacks one."""
         first, second = self.find(data, *one), self.find(data, *other)
         if first is None or second is None:
             return None
-        seeds = min(len(first.runs), len(second.runs))  # of each the profile's first ones
-        return replace(first, runs=first.runs[:seeds]), replace(second, runs=second.runs[:seeds])
+        # Of each the first ones.
+        seeds = min(len(first.runs), len(second.runs))
+        count = min(first.trajectories, second.trajectories)
+        return (
+            replace(first, runs=first.runs[:seeds], first=count),
+            replace(second, runs=second.runs[:seeds], first=count),
+        )
 
     def difference(self, one: Series, other: Series, scalar: str) -> Estimate:
-        """``one`` less ``other``, paired; of the same seeds."""
+        """``one`` less ``other``, paired; of the same seeds and trajectories."""
         return estimate(one.scalar(scalar) - other.scalar(scalar))

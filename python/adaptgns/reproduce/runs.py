@@ -514,7 +514,6 @@ class Run:
         if self.model.chosen is not None:
             chosen = self.data.rule(self.model.chosen)
             rule, radius = AdaptiveConfig(chosen["tau"], chosen["factor"]), chosen["radius"]
-        long = split == "long"
         return RolloutConfig(
             checkpoint=self.folder,
             out=self.folder / f"{self.model.name}-{policy}.h5",
@@ -524,8 +523,8 @@ class Run:
             adaptive=rule,
             radius=radius,
             k=max(1, round(self.data.described["valid_degree"])),
-            steps=None if long else profile.horizon,
-            trajectories=None if long else profile.trajectories,
+            steps=None if split == "long" else profile.horizon,
+            trajectories=profile.trajectories_of(self.model, split),
             seed=self.seed,
             device=self.study.device,
         )

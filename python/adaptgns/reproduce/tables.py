@@ -51,7 +51,10 @@ def _longer(percent: int) -> tuple[Comparison, ...]:
     questions: tuple[Comparison, ...] = (
         ("adaptive or fixed", (nll, "adaptive"), (nll, "fixed")),
         ("uncertain or random", (nll, "adaptive"), (nll, "random")),
+        ("random or fixed", (nll, "random"), (nll, "fixed")),
         ("two-sided or fixed", (nll, "two-sided"), (nll, "fixed")),
+        ("two-pass or fixed", (nll, "two-pass"), (nll, "fixed")),
+        ("k nearest or all within r", (nll, "knn"), (nll, "fixed")),
         ("lag and feedback: adaptive or two-pass", (nll, "adaptive"), (nll, "two-pass")),
         ("feedback: sigma on the adaptive or base graph", (nll, "adaptive"), (nll, "base-sigma")),
         ("lag: sigma on the base graph, before or now", (nll, "base-sigma"), (nll, "two-pass")),
@@ -59,11 +62,13 @@ def _longer(percent: int) -> tuple[Comparison, ...]:
         ("by sigma on the base graph, or random", (nll, "base-sigma"), (nll, "random")),
         ("sigma or the divergence around", (nll, "adaptive"), (nll, "divergence")),
         ("the divergence around or fixed", (nll, "divergence"), (nll, "fixed")),
+        ("the last acceleration or fixed", (nll, "acceleration"), (nll, "fixed")),
         ("adaptive NLL or fixed MSE: the aim", (nll, "adaptive"), (mse, "fixed")),
         ("the chosen rule or fixed MSE: the aim", (tuned, "adaptive"), (mse, "fixed")),
         ("the chosen rule or fixed, same model", (tuned, "adaptive"), (nll, "fixed")),
         ("the chosen rule, uncertain or random", (tuned, "adaptive"), (tuned, "random")),
         ("two-sided NLL or fixed MSE: the aim", (nll, "two-sided"), (mse, "fixed")),
+        ("the divergence around, NLL, or fixed MSE", (nll, "divergence"), (mse, "fixed")),
         ("NLL or MSE, fixed graphs", (nll, "fixed"), (mse, "fixed")),
         ("the divergence around or fixed, MSE", (mse, "divergence"), (mse, "fixed")),
     )
@@ -101,6 +106,11 @@ COMPARISONS: tuple[Comparison, ...] = (
         "uncertain or random, trained on adaptive graphs of r 0.01425, 4 times the training",
         ("nll-narrow-400", "adaptive"),
         ("nll-narrow-400", "random"),
+    ),
+    (
+        "random or fixed, trained on adaptive graphs of r 0.01425, 4 times the training",
+        ("nll-narrow-400", "random"),
+        ("nll-narrow-400", "fixed"),
     ),
     (
         "feedback, trained on adaptive graphs of r 0.01425, 4 times the training",
@@ -329,6 +339,7 @@ def _rollouts(results: Results, data: DataSet) -> Table:
                 [
                     series.model.title,
                     series.policy if series.model.edges else MISSING,
+                    series.sample,
                     *(_interval(series.estimate(f"mse@{each}"), ".2e") for each in marks),
                     _interval(series.estimate("edges_per_step"), ",.0f")
                     if series.model.edges
@@ -343,25 +354,27 @@ def _rollouts(results: Results, data: DataSet) -> Table:
                 [*series.files, where],
             )
         )
-    count = results.study.profile.trajectories
-    centre = [
-        np.array(data.described["centroid_mse"][str(each)][:count], dtype=np.float64)
-        for each in marks
-    ]
-    rows.append(
-        Row(
-            ["all particles at their true centre", MISSING]
-            + [_interval(estimate(each[None]), ".2e") for each in centre]
-            + [MISSING] * 7,
-            [str((data.metrics / "data.json").relative_to(results.study.out).as_posix())],
+    where = str((data.metrics / "data.json").relative_to(results.study.out).as_posix())
+    for count in sorted({series.trajectories for series in results.of(data.name)}):
+        centre = [
+            np.array(data.described["centroid_mse"][str(each)][:count], dtype=np.float64)
+            for each in marks
+        ]
+        rows.append(
+            Row(
+                ["all particles at their true centre", MISSING, f"{MISSING} × {count}"]
+                + [_interval(estimate(each[None]), ".2e") for each in centre]
+                + [MISSING] * 7,
+                [where],
+            )
         )
-    )
     return Table(
         f"rollouts-{data.name}",
         f"Rollouts on {data.name} (table 4)",
         (
             "model",
             "graph",
+            "seeds × trajectories",
             *(f"MSE@{each}" for each in marks),
             "edges a step",
             "edges within r, predicted",
@@ -403,6 +416,7 @@ def _comparisons(results: Results, data: DataSet) -> Table:
                     question,
                     f"{first[0]}, {first[1]}",
                     f"{second[0]}, {second[1]}",
+                    one.sample,
                     _change(results, one, other, "one_step_mse"),
                     *(_change(results, one, other, f"mse@{mark}") for mark in marks),
                     _change(results, one, other, "kinetic_energy_error"),
@@ -426,6 +440,7 @@ def _comparisons(results: Results, data: DataSet) -> Table:
             "question",
             "one",
             "other",
+            "seeds × trajectories",
             "one-step MSE",
             *(f"MSE@{mark}" for mark in marks),
             "kinetic energy error",
@@ -433,8 +448,8 @@ def _comparisons(results: Results, data: DataSet) -> Table:
             f"MSE@{marks[-1]}, seed by seed",
         ),
         rows,
-        "In percent of the other's mean. Differences are paired by trajectory and by seed, of the "
-        "seeds that both have; in brackets their 95 % interval, symmetric (Student's t), so that "
+        "In percent of the other's mean. Differences are paired, of the trajectories and the seeds "
+        "that both have; in brackets their 95 % interval, symmetric (Student's t), so that "
         "one of few heavy-tailed errors may pass -100 %, and not corrected for the number of "
         "comparisons. Single steps are from true positions.",
     )
@@ -457,6 +472,7 @@ def _clouds(results: Results, data: DataSet) -> Table:
             [
                 series.model.title,
                 series.policy if series.model.edges else MISSING,
+                series.sample,
                 _interval(series.estimate("kinetic_energy_error"), ".3f"),
                 *(_interval(matched(series, mark), ".1e") for mark in marks),
             ],
@@ -467,7 +483,13 @@ def _clouds(results: Results, data: DataSet) -> Table:
     return Table(
         f"clouds-{data.name}",
         f"Energy and where the matter is, {data.name}",
-        ("model", "graph", "kinetic energy error", *(f"transport@{mark}" for mark in marks)),
+        (
+            "model",
+            "graph",
+            "seeds × trajectories",
+            "kinetic energy error",
+            *(f"transport@{mark}" for mark in marks),
+        ),
         rows,
         "Kinetic energy: sum over the steps of the difference between predicted and true, over the "
         "sum of the true one. Transport: squared earth mover's distance between predicted and true "
@@ -611,6 +633,7 @@ def _along(results: Results, data: DataSet) -> Table:
             Row(
                 [
                     f"{share:.0%} of {data.steps:,}",
+                    fixed.sample,
                     _interval(fixed.estimate(f"mse@{mark}"), ".2e"),
                     _interval(fixed.estimate(f"clumping@{mark}"), ".2f"),
                     _change(results, adaptive, fixed, f"mse@{mark}"),
@@ -624,6 +647,7 @@ def _along(results: Results, data: DataSet) -> Table:
         f"Does the gain last as the model gets better? {data.name}",
         (
             "training steps",
+            "seeds × trajectories",
             f"MSE@{mark}, fixed",
             f"ratio@{mark}, fixed",
             "adaptive - fixed, of fixed",
@@ -662,9 +686,9 @@ def _calibration(results: Results, data: DataSet) -> list[Table]:
                 f"Calibration of {series.model.title} on {data.name} (table 3)",
                 ("decile of sigma", "mean squared error", "d·σ²", "|Δ|"),
                 rows,
-                "One step from true positions, normalized units, deciles of each seed averaged "
-                f"over the seeds. Rank correlation of sigma and error {ranks.mean():.2f} "
-                f"({', '.join(f'{rank:.2f}' for rank in ranks)}).",
+                f"One step from true positions of {series.trajectories} trajectories, normalized "
+                "units, deciles of each seed averaged over the seeds. Rank correlation of sigma "
+                f"and error {ranks.mean():.2f} ({', '.join(f'{rank:.2f}' for rank in ranks)}).",
             )
         )
     return made
