@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from pathlib import Path
 from datetime import timedelta
 
 import pytest
@@ -66,12 +67,15 @@ def test_what_all_have_met_the_first_tells(
     rank: int,
     alone: bool,
     told: int,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     def stop(*_: object) -> None:
         raise TrainingStopped("it ended", alone=alone)
 
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(dist, "broadcast_object_list", lambda *_, **__: None)
     monkeypatch.setattr(train, "processes", lambda _: nullcontext(Processes(rank, 2)))
     monkeypatch.setattr(train, "train", stop)
     with pytest.raises(SystemExit):
