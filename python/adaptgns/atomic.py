@@ -76,6 +76,14 @@ def write_json(path: Path, content: dict[str, Any] | list[Any]) -> None:
     replace_text(path, json.dumps(json_types(content, digits=6), allow_nan=False) + "\n")
 
 
+def read_json(path: Path) -> Any:
+    """What a file holds as JSON; ValueError, with its name, where it is none."""
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not readable as JSON: {error}") from None
+
+
 def six_digits(value: float) -> float:
     """``value`` as :func:`write_json` writes it."""
     return float(f"{value:.6g}")

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from adaptgns.command import plain_errors
-from adaptgns.data.check import Problem, find_problems
+from adaptgns.data.check import Problem, find_problems, vector_text
 from adaptgns.data.default import dataset_folder
 from adaptgns.data.errors import DataError
 from adaptgns.data.metadata import RADIUS_KEY, Metadata, read_metadata, states_radius
@@ -195,7 +195,7 @@ def _print_motion(
     table = _table(console, "motion per frame, train", "statistic", "stored", "computed")
     for name, key in FILE_KEYS.items():
         stored, own = np.array(getattr(metadata, name)), np.array(getattr(computed, name))
-        table.add_row(key, _vector(stored), _vector(own))
+        table.add_row(key, vector_text(stored), vector_text(own))
     console.print(table)
 
 
@@ -319,10 +319,6 @@ def _figures(value: np.floating[Any], digits: int) -> str:
     return np.format_float_positional(
         value, precision=digits, unique=False, fractional=False, trim="-"
     )
-
-
-def _vector(values: np.ndarray) -> str:
-    return " ".join(f"{value:.3g}" for value in values)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptgns.atomic import read_json
 from adaptgns.report import FORMAT, VERSION
 
 LOG, REPORT = "metrics.jsonl", "metrics.json"
@@ -119,10 +120,7 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def _read_report(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: not readable as JSON: {error}") from None
+    content = read_json(path)
     form = (content.get("format"), content.get("version")) if isinstance(content, dict) else None
     if form != (FORMAT, VERSION):
         raise ValueError(

@@ -9,14 +9,14 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 import torch
 import tyro
 from rich.console import Console
 
-from adaptgns.atomic import replace_text
+from adaptgns.atomic import read_json, replace_text
 from adaptgns.checkpoint import LAST, Checkpoint, checkpoint_file, read_checkpoint
 from adaptgns.command import plain_errors
 from adaptgns.config import (
@@ -97,7 +97,10 @@ def parse(arguments: list[str]) -> TrainConfig:
     if folder is not None:
         default = replace(_last_checkpoint(folder).config, resume=folder, out=folder)
     elif source is not None:
-        saved = from_json(TrainConfig, _read_object(Path(source)), source=source)
+        content = read_json(Path(source))
+        if not isinstance(content, dict):
+            raise ValueError(f"{source}: holds a {type(content).__name__}; an object is accepted")
+        saved = from_json(TrainConfig, content, source=source)
         # A new run, wherever the saved one lay and whether or not it had been resumed.
         default = replace(saved, resume=None, out=None)
     config = tyro.cli(
@@ -115,17 +118,6 @@ def parse(arguments: list[str]) -> TrainConfig:
             "(copy that to keep it as it is)"
         )
     return config
-
-
-def _read_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file; ValueError where there is none."""
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: not readable as JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: holds a {type(content).__name__}; an object is accepted")
-    return content
 
 
 def _last_checkpoint(folder: Path) -> Checkpoint:

@@ -194,8 +194,8 @@ class _Motion:
                     "length per frame²" if name.startswith("acceleration") else "length per frame"
                 )
                 yield (
-                    f"{key} is {_vector(stored)} in metadata.json, but {_vector(own)} here (in "
-                    f"{unit}); without the key it is computed anew"
+                    f"{key} is {vector_text(stored)} in metadata.json, but {vector_text(own)} here "
+                    f"(in {unit}); without the key it is computed anew"
                 )
 
 
@@ -250,5 +250,6 @@ class _Outside:
         )
 
 
-def _vector(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
+def vector_text(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
+    """Numbers of an axis each, short."""
     return " ".join(f"{value:.3g}" for value in values)
