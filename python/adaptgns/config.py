@@ -22,17 +22,11 @@ TYPE_EMBEDDING = 16
 
 Loss = Literal["nll", "beta-nll", "decoupled", "mse"]
 Preset = Literal["smoke", "laptop", "paper"]
-PolicyName = Literal[
-    "fixed",
-    "adaptive",
-    "two-sided",
-    "two-pass",
-    "base-sigma",
-    "random",
-    "acceleration",
-    "divergence",
-    "knn",
+RuledPolicy = Literal[
+    "adaptive", "two-sided", "two-pass", "base-sigma", "random", "acceleration", "divergence"
 ]
+"""Those under which some particles see farther, by the adaptive graph's rule"""
+PolicyName = Literal["fixed", RuledPolicy, "knn"]
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["float32", "bf16"]
 EdgeUpdate = Literal["fixed", "legacy"]

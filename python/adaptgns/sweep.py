@@ -1,9 +1,10 @@
 """`python -m adaptgns.sweep`: tau × factor × radius of the adaptive graph, on validation rollouts.
 
 Each trial rolls a trained model out under one rule, and notes the error at the last step and what
-the graph costs. Trials lie in a journal that several processes and machines can work on at once:
-run the same command again, here or there. Then the rule with the lowest error within the budget of
-edges is chosen, and a heat map drawn.
+the graph costs. Whom the rule lets see farther is a policy's choice, as a rule the uncertain ones.
+Trials lie in a journal that several processes and machines can work on at once: run the same
+command again, here or there. Then the rule with the lowest error within the budget of edges is
+chosen, and a heat map drawn.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ from rich.table import Table
 from adaptgns.atomic import write_json
 from adaptgns.checkpoint import read_checkpoint
 from adaptgns.command import plain_errors
-from adaptgns.config import HISTORY, AdaptiveConfig, Device, to_json, torch_device
+from adaptgns.config import HISTORY, AdaptiveConfig, Device, RuledPolicy, to_json, torch_device
 from adaptgns.data.trajectories import Trajectories
 from adaptgns.figures import STYLE, save
 from adaptgns.metrics import clumping, edge_counts, position_mse
-from adaptgns.policies import Adaptive
+from adaptgns.policies import make_policy
 from adaptgns.rollout import open_data, steps, tell_short
 from adaptgns.simulator import Simulator
 
@@ -55,15 +56,19 @@ class SweepConfig:
     """Search tau, factor and radius of the adaptive graph on validation rollouts."""
 
     checkpoint: Path
-    """Run folder or .safetensors file of a model with a variance."""
+    """Run folder or .safetensors file."""
     out: Path
     """Folder for the journal, sweep.json and the heat map."""
     data: str | None = None
     """Folder of a data set or name of an embedded one; None: the one the model was trained on."""
     split: Literal["train", "valid"] = "valid"
     """Which part of the data; the test split is for what was chosen."""
+    policy: RuledPolicy = "adaptive"
+    """Which particles see farther; all but acceleration and divergence need a model with a
+    variance."""
     tau: tuple[float, ...] = (50.0, 70.0, 90.0)
-    """Percentiles of sigma; other samplers than grid draw between the lowest and the highest."""
+    """Percentiles of sigma, or of the policy's own measure; other samplers than grid draw between
+    the lowest and the highest."""
     factor: tuple[float, ...] = (1.1, 1.267, 1.5)
     """Expansion factors, likewise."""
     radius: tuple[float, ...] = ()
@@ -83,7 +88,7 @@ class SweepConfig:
     """Database URL (such as postgresql://...) for trials of machines that share no folder; None:
     a journal in the folder."""
     seed: int = 0
-    """Seed of the samplers that draw."""
+    """Seed of the samplers that draw, and of the policy random."""
     device: Device = "auto"
     """auto: a GPU where there is one."""
 
@@ -98,7 +103,9 @@ class SweepConfig:
                     f"{name}: got {', '.join(map(str, values))}; each value is accepted once"
                 )
         for tau, factor in product(self.tau, self.factor):
-            AdaptiveConfig(tau, factor)  # which checks them
+            rule = AdaptiveConfig(tau, factor)  # which checks them
+            if self.policy == "two-sided":
+                rule.require_two_sides()
         for name in ("trials", "edges", "steps", "trajectories"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
@@ -110,7 +117,8 @@ class SweepConfig:
 def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
     """Make the trials that are missing, and write what came out; also returned.
 
-    Raises ValueError for a model without a variance, and where no trial is within the budget.
+    Raises ValueError for a model without the variance that the policy needs, and where no trial is
+    within the budget.
     """
     checkpoint = read_checkpoint(config.checkpoint)
     simulator = checkpoint.simulator().to(torch_device(config.device))
@@ -172,11 +180,12 @@ def measure(
     """Means over the trajectories, under one rule: ``mse`` at the last step, ``edges`` per step,
     ``clumping`` at the last step (edges within the data's radius, predicted over true) and
     ``milliseconds`` of a step's graph and model."""
-    policy = Adaptive(AdaptiveConfig(tau, factor))
     metadata = simulator.metadata
     rows = []
     for index in range(min(len(split), config.trajectories or len(split))):
         trajectory = split[index]
+        rule, seed = AdaptiveConfig(tau, factor), config.seed + index
+        policy = make_policy(config.policy, rule, k=0, seed=seed)
         true = trajectory.positions[HISTORY:][: config.steps]
         mobile = metadata.mobile(trajectory.particle_type)
         made = list(steps(simulator, trajectory, policy, len(true), radius=radius))
@@ -245,8 +254,10 @@ def _refuse_other(study: optuna.Study, config: SweepConfig) -> None:
     begun = study.user_attrs.get("config")
     if begun is None:
         study.set_user_attr("config", asked)
-    elif begun != asked:
-        different = sorted(name for name in asked if begun.get(name) != asked[name])
+        return
+    begun = {"policy": "adaptive"} | begun  # which older journals do not name
+    different = sorted(name for name in asked if begun.get(name) != asked[name])
+    if different:
         raise ValueError(
             f"out: {config.out} holds trials with other {', '.join(different)}; name another folder"
         )
@@ -314,7 +325,7 @@ def _heat_map(config: SweepConfig, trials: Sequence[FrozenTrial]) -> Figure:
         else:
             points = np.array([[trial.params["tau"], trial.params["factor"]] for trial in trials])
             ax.scatter(*points.T, c=errors, s=18, **scale)
-        ax.set_xlabel("tau, percentile of σ")
+        ax.set_xlabel("tau, percentile")
     panels[0].set_ylabel("factor")
     figure.colorbar(ScalarMappable(**scale), ax=list(panels), label=f"MSE@{config.steps}, length²")
     return figure

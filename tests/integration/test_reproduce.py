@@ -68,7 +68,7 @@ def test_every_table_and_figure_is_there(made: ReproduceConfig) -> None:
         assert "adaptive NLL or fixed MSE: the aim" in questions
         aim = "the chosen rule or fixed MSE: the aim, 4 times the training"
         assert (aim in questions) == (data == "waterdrop"), "trained on water alone"
-    for name in ("long", "sweep-400"):
+    for name in ("long", "sweep-400", "sweep-divergence-400"):
         assert f"{name}-waterdrop" in found
         assert f"{name}-sand" not in found
     report = (folder(made) / "report.md").read_text()
@@ -77,7 +77,7 @@ def test_every_table_and_figure_is_there(made: ReproduceConfig) -> None:
         assert (folder(made) / "figures" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
         assert (folder(made) / "figures" / f"{name}.pdf").read_bytes()[:5] == b"%PDF-"
     page = (folder(made) / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == len(FIGURES) + 3, "and a heat map a sweep"
+    assert page.count("data:image/png;base64,") == len(FIGURES) + 4, "and a heat map a sweep"
     assert page.count("<table>") == len(found)
     assert str(folder(made)) not in report + (folder(made) / "tables.json").read_text()
 
@@ -150,15 +150,20 @@ def test_long_rollouts_go_on_where_the_others_end(made: ReproduceConfig) -> None
 
 
 @pytest.mark.parametrize(
-    ("tuned", "sweep", "budget", "seeds", "sets"),
+    ("tuned", "policy", "sweep", "budget", "seeds", "sets"),
     [
-        ("tuned", "sweep", "mse", (0, 1), ("waterdrop", "sand")),
-        ("tuned-400", "sweep-400", "nll-400", (0,), ("waterdrop",)),
+        ("tuned", "adaptive", "sweep", "mse", (0, 1), ("waterdrop", "sand")),
+        ("tuned-400", "adaptive", "sweep-400", "mse-400", (0,), ("waterdrop",)),
+        (
+            *("tuned-divergence-400", "divergence", "sweep-divergence-400", "mse-400"),
+            *((0,), ("waterdrop",)),
+        ),
     ],
 )
 def test_the_chosen_rule_is_within_the_budget_and_what_is_reported(
     made: ReproduceConfig,
     tuned: str,
+    policy: str,
     sweep: str,
     budget: str,
     seeds: tuple[int, ...],
@@ -173,9 +178,9 @@ def test_the_chosen_rule_is_within_the_budget_and_what_is_reported(
         valid = json.loads((metrics / f"{budget}-0-fixed-valid.json").read_text())["rollouts"][0]
         assert edges == pytest.approx(valid["scalars"]["edges_per_step"]["mean"], rel=1e-5)
         for seed in seeds:
-            path = metrics / f"{tuned}-{seed}-adaptive.json"
+            path = metrics / f"{tuned}-{seed}-{policy}.json"
             row = json.loads(path.read_text())["rollouts"][0]
-            assert row["settings"]["training"]["steps"] == (48 if tuned == "tuned-400" else 12)
+            assert row["settings"]["training"]["steps"] == (12 if tuned == "tuned" else 48)
             assert row["settings"]["radius"] == chosen["radius"]
             assert row["settings"]["adaptive"]["factor"] == chosen["factor"]
             assert row["settings"]["training"]["seed"] == seed
@@ -212,7 +217,8 @@ def test_a_missing_run_is_told_and_the_report_stays(study: ReproduceConfig) -> N
 def test_what_the_package_ships_is_not_trained(
     made: ReproduceConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither for its own rollouts nor for what builds on them, unless anything differs."""
+    """Neither for its own rollouts nor for what builds on them, unless anything differs. (The
+    chosen rules need edges of a model that is not shipped besides.)"""
     trained = folder(made) / "training" / "waterdrop" / "nll-400-0"
     shipped = tmp_path / "shipped" / "waterdrop.safetensors"
     shipped.parent.mkdir()
@@ -225,6 +231,9 @@ def test_what_the_package_ships_is_not_trained(
     monkeypatch.setattr("adaptgns.reproduce.runs.train", failing)
     config = replace(made, out=tmp_path / "study", only="waterdrop/*-400-0", data=("waterdrop",))
     shutil.copytree(folder(made) / "data", folder(config) / "data")
+    budget = Path("metrics", "waterdrop", "mse-400-0-fixed-valid.json")
+    (folder(config) / budget).parent.mkdir(parents=True)
+    shutil.copyfile(folder(made) / budget, folder(config) / budget)
     with pytest.raises(RuntimeError, match="1 runs failed: waterdrop/mse-400-0"):
         reproduce(config, QUIET)
     for name in ("nll-400-0-random.json", "nll-400-0-fixed-long.json", "tuned-400-0-adaptive.json"):
@@ -348,12 +357,9 @@ def spoil(path: Path, **changes: object) -> None:
     [
         ("sand/nll-0-fixed.json", {"data_fingerprint": "another"}, "was measured on other data"),
         ("sand/nll-0-fixed.json", {"marks": [5, 20]}, r"was measured at other steps, \[5, 20\]"),
-        ("sand/sweep/sweep.json", {"settings": {"edges": 1.0, "tau": [80.0]}}, "was made with tau"),
-        (
-            "waterdrop/sweep-400/sweep.json",
-            {"settings": {"edges": 1.0, "steps": 9}},
-            "was made with steps",
-        ),
+        ("sand/sweep/sweep.json", {"settings": {"tau": [80.0]}}, "was made with tau"),
+        ("sand/sweep/sweep.json", {"settings": {"edges": 1.0}}, "was made with edges 1.0; the"),
+        ("waterdrop/sweep-400/sweep.json", {"settings": {"steps": 9}}, "was made with steps"),
         ("waterdrop/nll-400-0-fixed-long.json", {"data_fingerprint": "x"}, "on other data"),
         ("waterdrop/nll-400-0-fixed-long.json", {"marks": [5, 20]}, "measured at other steps"),
     ],
@@ -609,11 +615,16 @@ def test_models_of_the_same_length_differ_in_colour(preset: ProfileName) -> None
 
 def test_titles_tell_length_and_seeds() -> None:
     laptop = PROFILES["laptop"]
-    titles = {name: laptop.model(name).title for name in ("nll", "nll-30", "nll-400", "beta-nll")}
+    titles = {
+        name: laptop.model(name).title
+        for name in ("nll", "nll-30", "nll-400", "nll-narrow-400", "beta-nll")
+    }
     assert titles == {
         "nll": "GNS, NLL",
         "nll-30": "GNS, NLL, 30 % of the steps",
-        "nll-400": "GNS, NLL, 400 % of the steps, one seed",
+        "nll-400": "GNS, NLL, 400 % of the steps",
+        "nll-narrow-400": "AdaptGNS, trained on adaptive graphs, r 0.01425, "
+        "400 % of the steps, one seed",
         "beta-nll": "GNS, beta-NLL, one seed",
     }
 

@@ -278,6 +278,7 @@ EDGES = (np.zeros((1, 2), np.float32), INDEX)
             ValueError,
             r"got maps of \[3, 4\] outputs for edges, must be 4",
         ),
+        ({"perceptrons": [GOOD[0] + norm(4), *GOOD[1:]]}, ValueError, "behind scale and shift"),
         ({"threads": 0}, ValueError, "threads: got 0"),
     ],
 )
@@ -292,6 +293,13 @@ def test_what_does_not_fit_is_refused(change: dict, kind: type[Exception], messa
     network_forward(**arguments)
     with pytest.raises(kind, match=message):
         network_forward(**(arguments | change))
+
+
+def test_what_does_not_fit_in_memory_is_told_before_it_begins() -> None:
+    wide = linear(1_000_000, 1)
+    rows = np.zeros((10_000_000, 1), np.float32)
+    with pytest.raises(MemoryError, match="takes at least 40000000000000 bytes .* holds"):
+        network_forward([wide], rows, None, heads=0, keep=False)
 
 
 def test_a_tape_goes_with_its_own_pass() -> None:
@@ -311,6 +319,15 @@ def test_a_tape_goes_with_its_own_pass() -> None:
             tape,
             [ones],
         )
+    for by_sender in ([1, 0], [0, 0], [0, 2]):
+        two = (
+            np.zeros((2, 2), np.float32),
+            [np.array([0, 1]), np.array([1, 1]), np.array([0, 0, 2])],
+        )
+        _, other = network_forward(GOOD, NODES, two, heads=1, keep=True)
+        wrong = (two[0], [*two[1], np.array(by_sender), np.array([0, 1, 2])])
+        with pytest.raises(ValueError, match="by_sender: must"):
+            network_backward(GOOD, NODES, wrong, other, [ones])
     deeper = [*GOOD[:4], [*linear(4, 4), *linear(2, 4)]]
     with pytest.raises(ValueError, match="tape: comes from another network"):
         network_backward(deeper, NODES, backward, tape, [ones])

@@ -35,6 +35,11 @@ REFUSALS: list[Refusal] = [
     (lambda: radius_graph(POS, "1"), TypeError, "r: got str, must be a number"),
     (lambda: radius_graph(POS, True), TypeError, "r: got bool, must be a number"),
     (lambda: radius_graph(POS, None), TypeError, "r: got NoneType, must be a number"),
+    (lambda: radius_graph(POS, 1 + 0j), TypeError, "r: got complex, must be a number"),
+    (lambda: radius_graph(POS, np.complex64(1)), TypeError, "r: got complex64, must be a number"),
+    (lambda: radius_graph(POS, np.True_), TypeError, "r: got bool, must be a number"),
+    (lambda: radius_graph(POS, 10**400), ValueError, "r: got inf, must be a finite number > 0"),
+    (lambda: radius_graph(POS, -(10**400)), ValueError, "r: got -inf, must be a finite number > 0"),
     (
         lambda: radius_graph(POS, np.array([1, 1, 1])),
         TypeError,

@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from rich.console import Console
 
-from adaptgns.sweep import RESULT, SweepConfig, main, measure, sweep
+from adaptgns.config import AdaptiveConfig, RolloutConfig, RuledPolicy
+from adaptgns.evaluate import measure as evaluate
+from adaptgns.rollout import write_rollouts
+from adaptgns.sweep import JOURNAL, RESULT, SweepConfig, main, measure, sweep
 from adaptgns.train import main as train
 
 QUIET = Console(quiet=True)
@@ -64,6 +68,52 @@ def test_what_was_tried_is_not_tried_again(
     assert sweep(config, QUIET)["trials"] == second["trials"]
     with pytest.raises(ValueError, match="holds trials with other steps"):
         sweep(replace(config, steps=4), QUIET)
+
+
+def test_journals_that_name_no_policy_are_of_the_adaptive_one(
+    config: SweepConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every = sweep(config, QUIET)["trials"]
+    journal = config.out / JOURNAL
+    text = journal.read_text()
+    assert '"policy":"adaptive",' in text
+    journal.write_text(text.replace('"policy":"adaptive",', ""))
+    monkeypatch.setattr("adaptgns.sweep.measure", None)  # nothing is left to measure
+    assert sweep(config, QUIET)["trials"] == every
+    with pytest.raises(ValueError, match="holds trials with other policy"):
+        sweep(replace(config, policy="divergence"), QUIET)
+
+
+@pytest.mark.parametrize("policy", get_args(RuledPolicy))
+def test_any_rule_can_be_searched(config: SweepConfig, run: Path, policy: RuledPolicy) -> None:
+    config = replace(config, policy=policy, tau=(70.0,), radius=(0.015,))
+    [row] = sweep(config, QUIET)["trials"]
+    rollout = RolloutConfig(
+        checkpoint=run,
+        out=config.out / "rollouts.h5",
+        split="valid",
+        policy=policy,
+        adaptive=AdaptiveConfig(70.0, 1.2),
+        steps=config.steps,
+        device="cpu",
+    )
+    write_rollouts(rollout, QUIET)
+    scalars = evaluate([rollout.out], (config.steps,)).to_json()["rollouts"][0]["scalars"]
+    for name, scalar in (("mse", f"mse@{config.steps}"), ("edges", "edges_per_step")):
+        assert row[name] == pytest.approx(scalars[scalar]["mean"], rel=1e-5)
+
+
+def test_only_priors_do_without_a_variance(
+    drops: Path, tmp_path: Path, config: SweepConfig
+) -> None:
+    out = tmp_path / "mse"
+    where = ["--data", str(drops), "--out", str(out)]
+    train(["--preset", "smoke", "--steps", "5", "--loss", "mse", *where])
+    config = replace(config, checkpoint=out, tau=(70.0,), radius=(0.015,))
+    with pytest.raises(ValueError, match="policy: got adaptive, which needs the model's variance"):
+        sweep(config, QUIET)
+    config = replace(config, policy="divergence", out=tmp_path / "divergence")
+    assert len(sweep(config, QUIET)["trials"]) == 1
 
 
 def test_an_interrupted_trial_is_made_again(
@@ -135,6 +185,7 @@ def test_the_command(config: SweepConfig, capsys: pytest.CaptureFixture[str]) ->
     assert "chosen: tau 70, factor 1.2, radius 0.015" in capsys.readouterr().out
     for wrong, message in (
         (["--tau", "120"], "tau: got 120.0; accepted are numbers from 0 to 100"),
+        (["--policy", "two-sided", "--tau", "20"], "low_tau: got 30; accepted for two-sided"),
         (["--steps", "0"], "steps: got 0; accepted are numbers above 0"),
         (["--radius", "-1"], "radius: got (-1.0,)"),
     ):

@@ -37,6 +37,7 @@ COLOURS = {
     "beta-nll": SERIES[3],
     "mse-denser": SERIES[4],
     "tuned": "#b0528f",
+    "tuned-divergence": "#d98cc0",
     "decoupled": "#4f8f3a",
     "decoupled-weight": "#9bc53d",
     "decoupled-deep": "#1f4d2b",

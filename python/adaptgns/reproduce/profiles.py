@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from adaptgns.atomic import six_digits
-from adaptgns.config import HISTORY, AdaptiveConfig, Loss, PolicyName, TrainConfig
+from adaptgns.config import HISTORY, AdaptiveConfig, Loss, PolicyName, RuledPolicy, TrainConfig
 from adaptgns.data.generation import SplitPlan
 from adaptgns.presets import PRESETS
 
@@ -32,6 +32,8 @@ class Chosen:
     """Name of the model whose fixed graph has as many edges there as the rule may have"""
     folder: str
     """Name of the sweep's folder"""
+    policy: RuledPolicy = "adaptive"
+    """Which particles see farther"""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ class Model:
     """Of the profile's training steps"""
     seeds: int | None = None
     """How many of the profile's seeds, from the first; None: all"""
+    seeds_on: Mapping[str, int] = field(default_factory=dict)
+    """The same on embedded data sets where it has been trained with more"""
     sets: tuple[str, ...] | None = None
     """The embedded data sets that it is trained on; None: all, and any"""
     timed_as: str | None = None
@@ -71,7 +75,9 @@ class Model:
     def length(self) -> str:
         """What sets its training apart from that of others of its kind; as a rule nothing."""
         share = "" if self.share == 1 else f"{100 * self.share:.0f} % of the steps"
-        return ", ".join(filter(None, (share, "one seed" if self.seeds == 1 else "")))
+        return ", ".join(
+            filter(None, (share, "one seed" if self.seeds == 1 and not self.seeds_on else ""))
+        )
 
     @property
     def title(self) -> str:
@@ -125,6 +131,13 @@ TUNED = Model(
     policies=("adaptive", "random"),
     chosen=Chosen(weights="nll", budget="mse", folder="sweep"),
 )
+TUNED_DIVERGENCE = Model(
+    "tuned-divergence",
+    "GNS, NLL, chosen rule of the divergence",
+    "nll",
+    policies=("divergence",),
+    chosen=Chosen("nll", "mse", folder="sweep-divergence", policy="divergence"),
+)
 EARLY = tuple(
     replace(
         NLL,
@@ -137,9 +150,9 @@ EARLY = tuple(
 )
 
 
-def longer(percent: int, budget: Model) -> tuple[Model, Model, Model]:
-    """MSE, NLL and the chosen rule, trained for so many percent of the steps with the first seed;
-    the rule may have as many edges as the fixed graph of ``budget``, trained as long."""
+def longer(percent: int, *tuned: Model) -> tuple[Model, ...]:
+    """MSE, NLL and its chosen rules ``tuned``, trained for so many percent of the steps with the
+    first seed; the rules may have as many edges as the fixed graph of MSE."""
 
     def of(model: Model, **settings: Any) -> Model:
         return replace(
@@ -151,11 +164,20 @@ def longer(percent: int, budget: Model) -> tuple[Model, Model, Model]:
             **settings,
         )
 
-    chosen = Chosen(f"{NLL.name}-{percent}", f"{budget.name}-{percent}", f"sweep-{percent}")
+    def within_edges(model: Model) -> Model:
+        assert model.chosen is not None
+        chosen = replace(
+            model.chosen,
+            weights=f"{NLL.name}-{percent}",
+            budget=f"{MSE.name}-{percent}",
+            folder=f"{model.chosen.folder}-{percent}",
+        )
+        return of(model, chosen=chosen)
+
     return (
         of(MSE, timed_as=MSE.name, policies=("fixed", "divergence")),
         of(NLL, timed_as=NLL.name, policies=(*NLL.policies, "base-sigma")),
-        of(TUNED, chosen=chosen),
+        *map(within_edges, tuned),
     )
 
 
@@ -164,8 +186,10 @@ def on_water(models: Iterable[Model]) -> tuple[Model, ...]:
     return tuple(replace(model, sets=("waterdrop",)) for model in models)
 
 
-LONG = LONG_MSE, LONG_NLL, LONG_TUNED = longer(400, budget=NLL)  # which had fewer edges than MSE
-LONGEST = on_water(longer(800, budget=MSE))
+LONG = tuple(
+    replace(model, seeds_on={"waterdrop": 2}) for model in longer(400, TUNED, TUNED_DIVERGENCE)
+)
+LONGEST = on_water(longer(800, TUNED))
 ADAPTIVE_NLL = replace(
     NLL,
     name="nll-adaptive",
@@ -253,6 +277,7 @@ PAPER_MODELS = (
     BETA_NLL,
     MATCHED_MSE,
     TUNED,
+    TUNED_DIVERGENCE,
 )
 
 PROMINENT = {
@@ -278,6 +303,10 @@ class Sweep:
     radius: tuple[float, ...] = (0.85, 0.925, 1.0)
     """Times that of the data"""
     trajectories: int | None = None
+
+
+FEW_AND_FAR = Sweep(tau=(90.0, 95.0), factor=(1.5, 2.0), radius=(0.85, 0.9, 0.95, 1.0))
+SWEEPS: dict[RuledPolicy, Sweep] = {"adaptive": Sweep(), "divergence": FEW_AND_FAR}
 
 
 @dataclass(frozen=True)
@@ -308,7 +337,8 @@ class Profile:
     """Trajectories of a split that are rolled out, the first ones; None: all"""
     horizon: int | None = None
     """Frames of the rollouts; None: to the end"""
-    sweep: Sweep = Sweep()
+    sweeps: Mapping[RuledPolicy, Sweep] = field(default_factory=lambda: SWEEPS)
+    """By whom the rules let see farther"""
     gate: float | None = None
     """Edges on predicted over those on true positions that the fixed graph's baseline must come
     within at the last mark on validation; its training is doubled until then"""
@@ -319,9 +349,9 @@ class Profile:
     long: Mapping[str, Long] = field(default_factory=dict)
     """By data set: rollouts over far more frames than :attr:`horizon`"""
 
-    def seeds_of(self, model: Model) -> tuple[int, ...]:
-        """Those that ``model`` is trained with."""
-        return self.seeds[: model.seeds]
+    def seeds_of(self, model: Model, data: str) -> tuple[int, ...]:
+        """Those that ``model`` is trained with on the data set of that source."""
+        return self.seeds[: model.seeds_on.get(data, model.seeds)]
 
     def trajectories_of(self, model: Model, split: str) -> int | None:
         """How many of the split's trajectories ``model`` is rolled out over; None: all."""
@@ -351,9 +381,9 @@ PROFILES: dict[ProfileName, Profile] = {
             EARLY[1],
             DECOUPLED,
             TUNED,
-            *on_water(LONG),
+            *on_water(longer(400, TUNED, TUNED_DIVERGENCE)),
         ),
-        sweep=Sweep(tau=(70.0,), factor=(1.1, 1.267), radius=(0.9, 1.0)),
+        sweeps=dict.fromkeys(SWEEPS, Sweep(tau=(70.0,), factor=(1.1, 1.267), radius=(0.9, 1.0))),
         seeds=(0, 1),
         marks=(5, 10),
         horizon=10,
@@ -367,7 +397,7 @@ PROFILES: dict[ProfileName, Profile] = {
         },
         long={
             "waterdrop": Long(
-                LONG_NLL.name,
+                "nll-400",
                 marks=(10, 20, 40 - HISTORY),
                 plan=SplitPlan("waterdrop", 2, frames=40, particles=(30, 50)),
             )
@@ -382,8 +412,7 @@ PROFILES: dict[ProfileName, Profile] = {
             DECOUPLED,
             TWO_SIDED_NLL,
             *EARLY,
-            LONG_NLL,
-            LONG_MSE,
+            *LONG,
             LONG_NARROW,
             *LONGEST,
             ADAPTIVE_NLL,
@@ -393,9 +422,8 @@ PROFILES: dict[ProfileName, Profile] = {
             MATCHED_MSE,
             *ONE_SEED,
             TUNED,
-            LONG_TUNED,
         ),
-        sweep=Sweep(trajectories=5),
+        sweeps={name: replace(sweep, trajectories=5) for name, sweep in SWEEPS.items()},
         seeds=(0, 1, 2),
         marks=(50, 100, 200),
         trajectories=10,
@@ -403,7 +431,7 @@ PROFILES: dict[ProfileName, Profile] = {
         long={
             "waterdrop": replace(
                 WATER_TO_THE_END,
-                model=LONG_NLL.name,
+                model="nll-400",
                 plan=SplitPlan("waterdrop", 10, frames=1000),
             )
         },

@@ -113,7 +113,7 @@ def _markdown(study: Study, made: list[Table], images: list[Path]) -> str:
             folder = data.metrics / model.chosen.folder
             heat_map = (folder / f"{HEAT_MAP}.png").relative_to(study.out).as_posix()
             parts.append(
-                f"![{model.chosen.folder}]({heat_map})\n\n{model.title}: the adaptive rule on "
+                f"![{model.chosen.folder}]({heat_map})\n\n{model.title} on "
                 f"{data.name}, validation: error and, below it, edges a step."
             )
     for path in images:

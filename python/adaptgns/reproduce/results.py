@@ -156,7 +156,8 @@ class Results:
     def _series(
         self, data: DataSet, model: Model, policy: PolicyName, split: Split = "test"
     ) -> Series:
-        runs = tuple(Run(data, model, seed) for seed in self.study.profile.seeds_of(model))
+        seeds = self.study.profile.seeds_of(model, data.source)
+        runs = tuple(Run(data, model, seed) for seed in seeds)
         return Series(model, policy, runs, split)
 
     @cached_property

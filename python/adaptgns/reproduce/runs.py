@@ -127,7 +127,8 @@ class Study:
             for seed in self.profile.seeds:
                 for data in self.sets.values():
                     for model in self.profile.models_on(data.source):
-                        if model.depends == depends and seed in self.profile.seeds_of(model):
+                        seeds = self.profile.seeds_of(model, data.source)
+                        if model.depends == depends and seed in seeds:
                             yield Run(data, model, seed)
 
     @property
@@ -274,7 +275,7 @@ class DataSet:
         """What the sweep chose. StudyError where it is missing or was another one."""
         path = self.metrics / chosen.folder / RESULT
         content = read_json(path)
-        config = self._sweep_config(chosen, content["settings"]["edges"])
+        config = self._sweep_config(chosen)
         asked = json.loads(json.dumps(to_json(config)))
         for name, value in content["settings"].items():
             if asked[name] != value:
@@ -285,17 +286,21 @@ class DataSet:
         rule: dict[str, float] = content["chosen"]
         return rule
 
-    def _sweep_config(self, chosen: Chosen, budget: float) -> SweepConfig:
+    def _sweep_config(self, chosen: Chosen) -> SweepConfig:
         profile, radius = self.study.profile, float(self.described["radius"])
+        budget, rules = profile.model(chosen.budget), profile.sweeps[chosen.policy]
+        count = rules.trajectories
+        edges = valid_edges(self, budget, profile.seeds[0], "fixed", trajectories=count)
         return SweepConfig(
             checkpoint=Path(chosen.weights),
             out=self.metrics / chosen.folder,
-            tau=profile.sweep.tau,
-            factor=profile.sweep.factor,
-            radius=tuple(six_digits(share * radius) for share in profile.sweep.radius),
-            edges=budget,
+            policy=chosen.policy,
+            tau=rules.tau,
+            factor=rules.factor,
+            radius=tuple(six_digits(share * radius) for share in rules.radius),
+            edges=six_digits(edges),
             steps=self.study.last_mark,
-            trajectories=profile.sweep.trajectories,
+            trajectories=count,
             device=self.study.device,
         )
 
@@ -304,12 +309,9 @@ class DataSet:
         if (self.metrics / chosen.folder / RESULT).exists():
             return
         profile = self.study.profile
-        seed, count = profile.seeds[0], profile.sweep.trajectories
-        run = Run(self, profile.model(chosen.weights), seed)
+        run = Run(self, profile.model(chosen.weights), profile.seeds[0])
         run.require_training()
-        budget = profile.model(chosen.budget)
-        edges = valid_edges(self, budget, seed, "fixed", trajectories=count)
-        config = self._sweep_config(chosen, edges)
+        config = self._sweep_config(chosen)
         sweep(replace(config, checkpoint=run.checkpoint, data=str(self.folder)), console)
 
     def time_steps(self, runs: Sequence[Run]) -> None:

@@ -82,6 +82,16 @@ COMPARISONS: tuple[Comparison, ...] = (
     ("adaptive or fixed graph, same model", ("nll", "adaptive"), ("nll", "fixed")),
     ("uncertain or random particles expanded", ("nll", "adaptive"), ("nll", "random")),
     *_longer(400),
+    (
+        "the divergence's chosen rule or fixed MSE: the aim, 4 times the training",
+        ("tuned-divergence-400", "divergence"),
+        ("mse-400", "fixed"),
+    ),
+    (
+        "the divergence's chosen rule or fixed, same model, 4 times the training",
+        ("tuned-divergence-400", "divergence"),
+        ("nll-400", "fixed"),
+    ),
     *_longer(800),
     ("4 times the training or once, NLL", ("nll-400", "fixed"), ("nll", "fixed")),
     ("4 times the training or once, MSE", ("mse-400", "fixed"), ("mse", "fixed")),
@@ -593,7 +603,7 @@ def _sweep(results: Results, data: DataSet, model: Model, chosen: Chosen) -> Tab
     ]
     return Table(
         f"{chosen.folder}-{data.name}",
-        f"{model.title}: the adaptive rule on validation, {data.name}",
+        f"{model.title} on validation, {data.name}",
         (
             "tau",
             "factor",
@@ -654,8 +664,8 @@ def _along(results: Results, data: DataSet) -> Table:
             "edges a step",
         ),
         rows,
-        "Each row's models were trained from the start with a schedule of that length, those of "
-        "more than 100 % with one seed: their intervals are for the trajectories alone.",
+        "Each row's models were trained from the start with a schedule of that length. Intervals "
+        "of one seed are for the trajectories alone.",
     )
 
 

@@ -6,7 +6,7 @@ mod error;
 pub mod graph;
 pub mod mpm;
 pub mod network;
-mod pages;
+mod system;
 pub mod threads;
 
 pub use error::Error;

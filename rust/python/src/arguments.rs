@@ -6,7 +6,7 @@ use numpy::prelude::*;
 use numpy::{Element, PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArray};
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::PyBool;
+use pyo3::types::{PyBool, PyComplex};
 use std::num::NonZeroUsize;
 
 /// An array of real numbers, borrowed where it lies if its memory is in order.
@@ -74,14 +74,28 @@ pub fn numbers(argument: &str, value: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
     items.map(|item| number(argument, &item?)).collect()
 }
 
-/// A real number, but no bool and no array.
+/// A real number, but no bool and no array; infinite where it is too large for a float64.
 pub fn number(argument: &str, value: &Bound<'_, PyAny>) -> PyResult<f64> {
+    let kind = value
+        .getattr("dtype")
+        .and_then(|dtype| dtype.getattr("kind"));
     let refused = value.is_instance_of::<PyBool>()
+        || value.is_instance_of::<PyComplex>()
+        || kind.is_ok_and(|kind| !"iuf".contains(&kind.to_string()))
         || value
             .cast::<PyUntypedArray>()
             .is_ok_and(|array| array.ndim() > 0);
-    if !refused && let Ok(number) = value.extract() {
-        return Ok(number);
+    match value.extract() {
+        _ if refused => {}
+        Ok(number) => return Ok(number),
+        Err(error) if error.is_instance_of::<PyOverflowError>(value.py()) => {
+            return Ok(if value.lt(0)? {
+                -f64::INFINITY
+            } else {
+                f64::INFINITY
+            });
+        }
+        Err(_) => {}
     }
     Err(wrong_kind(argument, value, "a number"))
 }

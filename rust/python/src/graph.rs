@@ -27,7 +27,8 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 ///     Positions, ``d`` 2 or 3. Any strides; only what is not contiguous is copied.
 /// r : float, or float array ``[N]``
 ///     The radius in the unit of ``pos``, or one per particle: an edge wherever
-///     ``distance <= max(r[i], r[j])``.
+///     ``distance <= max(r[i], r[j])``. Every particle is compared with all that are within
+///     about the longest one.
 /// ptr : int64 array ``[B + 1]``, optional
 ///     Graph ``b`` of a batch holds the particles ``ptr[b]:ptr[b + 1]``; no edge joins two
 ///     graphs. One graph if absent.

@@ -187,7 +187,12 @@ fn perceptron<'a>(arrays: &'a [Reals<'_>], precision: Precision) -> PyResult<Mlp
     };
     for [first, second] in pairs {
         let (first_slice, second_slice) = (first.as_slice()?, second.as_slice()?);
-        if first.ndim() == 2 && mlp.norm.is_none() {
+        if mlp.norm.is_some() {
+            return Err(invalid(
+                "got arrays behind scale and shift, which come last".into(),
+            ));
+        }
+        if first.ndim() == 2 {
             if first.shape()[0] != second_slice.len() {
                 return Err(invalid(format!(
                     "got a weight of shape {:?} for {} biases",

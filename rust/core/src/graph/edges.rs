@@ -48,6 +48,15 @@ impl Rows {
         self.counts.push(n as u32);
     }
 
+    /// Gives back what was asked for in vain: a row has room for all candidates, which may be many
+    /// more than it holds.
+    pub fn trim(&mut self) {
+        if self.senders.len() > 4 * (self.used + ROOM) {
+            self.senders.truncate(self.used + ROOM);
+            self.senders.shrink_to_fit();
+        }
+    }
+
     #[cold]
     fn grow(&mut self, most: usize, budget: &Budget) -> Result<(), Error> {
         budget.charge(self.used - self.charged)?;

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::Error;
-use crate::pages;
+use crate::system;
 use crate::threads::Team;
 
 /// Bytes that an edge takes while a graph is assembled: two 64-bit indices in the
@@ -38,7 +38,7 @@ impl Budget {
         let room = || {
             *self
                 .room
-                .get_or_init(|| available_memory() / BYTES_PER_EDGE)
+                .get_or_init(|| system::available_memory() / BYTES_PER_EDGE)
         };
         if edges <= UNASKED || edges <= room() {
             return Ok(());
@@ -49,18 +49,6 @@ impl Budget {
             room()
         )))
     }
-}
-
-/// Bytes the machine, or the control group of this process, can still give; without
-/// bound where the system does not tell.
-fn available_memory() -> usize {
-    let Ok(mut system) = sysinfo::System::new() else {
-        return usize::MAX;
-    };
-    system.refresh_memory();
-    let group = system.cgroup_limits().map(|limits| limits.free_memory);
-    let bytes = system.available_memory().min(group.unwrap_or(u64::MAX));
-    usize::try_from(bytes).unwrap_or(usize::MAX)
 }
 
 /// `count` times `value`, in memory as [`reserve`] asks for it.
@@ -118,6 +106,6 @@ pub(super) fn room<T>(count: usize) -> Vec<T> {
 pub(super) fn reserve<T>(count: usize) -> Option<Vec<T>> {
     let mut room = Vec::<T>::new();
     room.try_reserve_exact(count).ok()?;
-    pages::ask_for_large(room.as_mut_ptr(), count);
+    system::ask_for_large(room.as_mut_ptr(), count);
     Some(room)
 }

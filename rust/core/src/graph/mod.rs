@@ -14,6 +14,8 @@
 //!   edge in each direction however short the period is.
 //! - Distances are computed and compared in the type of the positions. A pair within
 //!   rounding of the cutoff may fall either way; both directions fall the same way.
+//!   Along a periodic axis positions outside `[0, L)` are wrapped into it first, which
+//!   rounds them as numbers as large as `L` are.
 
 mod adaptive;
 mod edges;

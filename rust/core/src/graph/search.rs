@@ -144,6 +144,7 @@ impl<T: Scalar, const D: usize, const PERIODIC: bool, const UNIFORM: bool> Work
             receivers = next;
             std::mem::swap(&mut candidates, &mut coming);
         }
+        rows.trim();
         Ok(rows)
     }
 }

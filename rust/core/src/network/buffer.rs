@@ -9,10 +9,14 @@ use std::ptr::NonNull;
 use std::slice;
 use std::sync::{Mutex, MutexGuard};
 
-use crate::pages;
+use crate::Error;
+use crate::system;
 
 /// The most numbers that wait for use (1 GiB); what goes beyond is freed.
 const MOST: usize = 1 << 28;
+
+/// Bytes up to which nobody asks how much memory there is, which takes longer than a small pass.
+const UNASKED: usize = 1 << 30;
 
 static FREE: Mutex<Vec<Memory>> = Mutex::new(Vec::new());
 
@@ -23,6 +27,22 @@ fn free() -> Option<MutexGuard<'static, Vec<Memory>>> {
         std::hint::spin_loop();
         FREE.try_lock().ok()
     })
+}
+
+/// Fails if there is no memory for `bytes` in buffers, beside what waits for use.
+pub(super) fn check_room(bytes: usize) -> Result<(), Error> {
+    if bytes <= UNASKED {
+        return Ok(());
+    }
+    let waiting = free().map_or(0, |free| free.iter().map(|memory| memory.capacity).sum());
+    let room = system::available_memory().saturating_add(waiting * size_of::<f32>());
+    if bytes <= room {
+        return Ok(());
+    }
+    Err(Error::OutOfMemory(format!(
+        "the network takes at least {bytes} bytes for so many particles and edges and the \
+         available memory holds {room}; use fewer, or a narrower network"
+    )))
 }
 
 /// Room for numbers, each of which has some value.
@@ -45,7 +65,7 @@ impl Memory {
             // SAFETY: the layout has bytes, and zeros are numbers.
             let start = unsafe { System.alloc_zeroed(layout) };
             let start = NonNull::new(start.cast()).unwrap_or_else(|| handle_alloc_error(layout));
-            pages::ask_for_large(start.as_ptr(), capacity);
+            system::ask_for_large(start.as_ptr(), capacity);
             start
         };
         Self { start, capacity }

@@ -143,7 +143,22 @@ impl Edges<'_> {
             self.by_sender.len() == count && self.by_sender.iter().all(inside),
             "by_sender",
             || format!("must list the {count} edges"),
-        )
+        )?;
+        // Each of a sender's edges once, in order.
+        let sorted = self
+            .sender_offsets
+            .windows(2)
+            .enumerate()
+            .all(|(node, pair)| {
+                let own = &self.by_sender[pair[0] as usize..pair[1] as usize];
+                own.is_sorted_by(|one, next| one < next)
+                    && own
+                        .iter()
+                        .all(|&edge| self.senders[edge as usize] == node as i64)
+            });
+        require(sorted, "by_sender", || {
+            "must be the edges in the order of their senders".into()
+        })
     }
 }
 

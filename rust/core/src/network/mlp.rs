@@ -285,6 +285,18 @@ impl<'a> Mlp<'a> {
         }
     }
 
+    /// Bytes of what a pass keeps of a row.
+    pub(super) fn kept_bytes(&self) -> usize {
+        let hidden =
+            (self.hidden()).map(|(width, packed)| if packed { 2 * width } else { 4 * width });
+        let normed = if self.norm.is_some() {
+            self.outputs() + 1
+        } else {
+            0
+        };
+        hidden.sum::<usize>() + 4 * normed
+    }
+
     /// The same of a part of `rows` rows that pass.
     pub(super) fn passing(&self, rows: usize) -> KeptPart<'static> {
         let normed = if self.norm.is_some() { rows } else { 0 };

@@ -139,6 +139,32 @@ impl Network<'_> {
             + self.heads.iter().map(Mlp::parameters).sum::<usize>()
     }
 
+    /// Bytes that a forward pass takes at least: the latents, and with `keep` what goes backward.
+    fn least_bytes(&self, features: &Features<'_>, keep: bool) -> usize {
+        let (nodes, width) = (self.node_count(features), self.width());
+        let edges = features.edges.map_or(0, |(_, graph)| graph.senders.len());
+        let (mut of_node, mut of_edge) = (4 * width, 2 * width);
+        if keep {
+            let layers = self.layers.iter();
+            let on_nodes = layers.clone().map(|layer| &layer.node).chain(&self.heads);
+            let on_edges = layers.filter_map(|layer| layer.edge.as_ref());
+            of_node += [&self.node_encoder]
+                .into_iter()
+                .chain(on_nodes)
+                .map(Mlp::kept_bytes)
+                .sum::<usize>();
+            of_edge += self
+                .edge_encoder
+                .iter()
+                .chain(on_edges)
+                .map(Mlp::kept_bytes)
+                .sum::<usize>();
+        }
+        nodes
+            .saturating_mul(of_node)
+            .saturating_add(edges.saturating_mul(of_edge))
+    }
+
     /// `threads`, as far as there are parts for them.
     fn useful(&self, features: &Features<'_>, threads: Threads) -> Threads {
         let edges = features.edges.map_or(0, |(_, graph)| graph.senders.len());
@@ -155,6 +181,7 @@ impl Network<'_> {
         threads: Threads,
     ) -> Result<(Vec<Vec<f32>>, Option<Tape>), crate::Error> {
         self.check(&features)?;
+        buffer::check_room(self.least_bytes(&features, keep))?;
         Ok(threads::team(self.useful(&features, threads), |team| {
             self.pass_forward(features, keep, team)
         }))

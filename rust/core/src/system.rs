@@ -1,4 +1,21 @@
-//! Large pages for large memory.
+//! What the system gives of memory: how much, and in large pages.
+
+use sysinfo::{Pid, ProcessRefreshKind, ProcessesToUpdate, System};
+
+/// Bytes that the machine, or the control groups of this process, can still give; without bound
+/// where the system does not tell.
+pub(crate) fn available_memory() -> usize {
+    let Ok(mut system) = System::new() else {
+        return usize::MAX;
+    };
+    system.refresh_memory();
+    let own = Pid::from_u32(std::process::id());
+    let kind = ProcessRefreshKind::nothing().without_tasks();
+    system.refresh_processes_specifics(ProcessesToUpdate::Some(&[own]), false, kind);
+    let group = system.process(own).and_then(|own| own.cgroup_limits());
+    let group = group.map_or(u64::MAX, |limits| limits.free_memory);
+    usize::try_from(system.available_memory().min(group)).unwrap_or(usize::MAX)
+}
 
 /// Asks the system to map the room for `count` values at `start` in large pages, where that is
 /// worth it: fresh memory costs a page fault per page, and reading here and there a walk through
