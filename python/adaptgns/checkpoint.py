@@ -93,16 +93,17 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         partial.write_bytes(save(checkpoint.tensors, header))
 
 
-def read_checkpoint(path: Path, *, device: str = "cpu") -> Checkpoint:
+def read_checkpoint(path: Path) -> Checkpoint:
     """The checkpoint in the file ``path``, or in the run folder ``path``: its best one, else its
     last. The name of an embedded data set, where there is no such file or folder, stands for the
     pretrained one.
 
-    Raises :class:`CheckpointError` where there is none or it is not whole.
+    Raises :class:`CheckpointError` where there is none or it is not whole, ConfigError or DataError
+    where its configuration or its data's metadata are not of this version.
     """
     file = checkpoint_file(path)
     try:
-        with safe_open(file, framework="pt", device=device) as archive:
+        with safe_open(file, framework="pt") as archive:
             header = archive.metadata() or {}
             tensors = {name: archive.get_tensor(name) for name in archive.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:

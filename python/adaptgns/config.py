@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import cattrs
 import torch
@@ -198,7 +198,8 @@ class TrainConfig:
     """Of the loss decoupled: the variance stands for the error one frame later, on the graph that
     it chooses; needs unroll >= 2."""
     graph: Literal["base", "adaptive", "two-sided"] = "base"
-    """Graph seen in training; all but base have the one-step lag of the rollout."""
+    """Graph seen in training; all but base have the one-step lag of the rollout. Validation always
+    rolls out on the base graph."""
     steps: int = 20_000
     """Optimizer steps."""
     batch: int = 2
@@ -305,7 +306,28 @@ def torch_device(name: Device) -> torch.device:
 
 _converter = make_converter(forbid_extra_keys=True)
 _converter.register_unstructure_hook(Path, str)
-_converter.register_structure_hook(Path, lambda value, _: Path(value))
+_converter.register_structure_hook(Path, lambda value, _: Path(_exactly(value, str)))
+_converter.register_structure_hook(float, lambda value, _: float(_exactly(value, float, int)))
+for plain in (bool, int, str):
+    _converter.register_structure_hook(plain, lambda value, kind: _exactly(value, kind))  # noqa: PLW0108
+_converter.register_structure_hook_func(
+    lambda kind: get_origin(kind) is Literal,  # type: ignore[comparison-overlap]
+    lambda value, kind: _one_of(value, get_args(kind)),
+)
+
+
+def _one_of(value: Any, accepted: tuple[Any, ...]) -> Any:
+    """``value`` if it is one of ``accepted``."""
+    if value not in accepted:
+        raise ValueError(f"got {value!r}; accepted are {', '.join(map(str, accepted))}")
+    return value
+
+
+def _exactly(value: Any, *kinds: type) -> Any:
+    """``value`` if it is of one of these types; cattrs would make one of nearly anything."""
+    if type(value) not in kinds:
+        raise ValueError(f"got {value!r}; accepted is a value of type {kinds[0].__name__}")
+    return value
 
 
 class ConfigError(ValueError):
@@ -334,4 +356,6 @@ def _describe(error: BaseException, kind: type | None) -> str:
     """A problem in a configuration, in words; those that ``_require`` found have their own."""
     if type(error) is ValueError and str(error):
         return str(error)
+    if isinstance(error, AttributeError):  # what should be an object has no keys
+        return "an object is accepted"
     return format_exception(error, kind)

@@ -199,19 +199,19 @@ def _convert_folder(config: ConvertConfig, console: Console) -> list[str]:
     content = _content(source)
     dim = config.dim or (None if content is None else training_section(content).get("dim"))
     with folder_written_whole(dest) as partial:
-        with progress_bar(console, "trajectories") as progress:
-            for split, path in found.items():
-                trajectories = _open(path, dim, flatten=config.dim == 2)
-                _write(partial / f"{split}{suffix}", suffix, _told(trajectories, split, progress))
-        if content is None:
-            return [
-                f"there is no {source / FILE_NAME}; write {dest / FILE_NAME} with dim, dt, bounds "
-                "and default_connectivity_radius"
-            ]
         try:
-            return _write_metadata(partial, content, suffix)
+            with progress_bar(console, "trajectories") as progress:
+                for split, path in found.items():
+                    trajectories = _told(_open(path, dim, flatten=config.dim == 2), split, progress)
+                    _write(partial / f"{split}{suffix}", suffix, trajectories)
+            if content is not None:
+                return _write_metadata(partial, content, suffix)
         except DataError as error:  # which is the source's, though found in the copy
             raise DataError(str(error).replace(str(partial), str(source))) from error
+        return [
+            f"there is no {source / FILE_NAME}; write {dest / FILE_NAME} with dim, dt, bounds "
+            "and default_connectivity_radius"
+        ]
 
 
 def _content(folder: Path) -> dict[str, Any] | None:

@@ -107,7 +107,7 @@ class Figures:
         for rollout, name in zip(self._rollouts, self._names, strict=True):
             style: dict[str, Any] = {
                 "color": self._colour(rollout),
-                "linestyle": DASHES[rollout.rule],
+                "linestyle": DASHES.get(rollout.rule, "-"),
             }
             for ax, key in ((errors, "mse"), (edges, "edges")):
                 curve = rollout.curve(key)
@@ -135,8 +135,8 @@ class Figures:
                 predicted,
                 measured,
                 color=self._colour(rollout),
-                linestyle=DASHES[rollout.rule],
-                marker=MARKERS[rollout.rule],
+                linestyle=DASHES.get(rollout.rule, "-"),
+                marker=MARKERS.get(rollout.rule, "o"),
                 markersize=3.5,
                 label=name,
             )
@@ -168,7 +168,7 @@ class Figures:
                     mse.mean(),
                     yerr=error,
                     color=self._colour(rollout),
-                    marker=MARKERS[rollout.rule],
+                    marker=MARKERS.get(rollout.rule, "o"),
                     linestyle="none",
                     capsize=2,
                     label=name,

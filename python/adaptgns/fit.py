@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import time
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +17,7 @@ from rich.console import Console
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
+from adaptgns.atomic import replace_text
 from adaptgns.checkpoint import (
     BEST,
     LAST,
@@ -25,6 +27,7 @@ from adaptgns.checkpoint import (
     write_checkpoint,
 )
 from adaptgns.config import TrainConfig, torch_device
+from adaptgns.data.errors import DataError
 from adaptgns.data.metadata import Metadata
 from adaptgns.data.trajectories import Trajectories
 from adaptgns.graph import adaptive_graph, radius_graph
@@ -109,7 +112,8 @@ class Trainer:
         self.windows = Windows(train, metadata, config, noise=config.noise)
         if not len(self.windows):
             raise ValueError(
-                f"{train.path}: a sample needs {self.windows.frames} frames; no trajectory has them"
+                f"{train.path}: a sample needs {self.windows.frames} frames with unroll "
+                f"{config.unroll} and graph {config.graph}; no trajectory has them"
             )
 
     def _restore(self, checkpoint: Checkpoint) -> None:
@@ -193,6 +197,7 @@ class Trainer:
             Log(self.folder, self.step) if self.processes.first else nullcontext() as log,
             interruption(insistent=self.processes.count == 1) as interrupted,
             progress,
+            _workers_end_with(batches),
         ):
             task = progress.add_task(
                 "training", total=config.steps, completed=self.step, loss="-", speed="-"
@@ -214,7 +219,7 @@ class Trainer:
                     self.save()
                     logged = time.perf_counter()
                     continue
-                batch = next(batches)
+                batch = self._next(batches)
                 losses.append(self.train_step(None if batch is None else batch.to(self.device)))
                 self.step += 1
                 progress.advance(task)
@@ -236,6 +241,15 @@ class Trainer:
                 if self.step % config.checkpoint_every == 0 or last or due:
                     self._mean_loss(losses)
                     self.save()
+
+    def _next(self, batches: Iterator[Batch | None]) -> Batch | None:
+        try:
+            return next(batches)
+        except DataError as error:  # of a worker: with the trace of its process
+            told = str(error).rstrip().splitlines()[-1]
+        if self.processes.count == 1:  # else the others are not here to save with
+            self.save()
+        raise DataError(told.removeprefix(f"{DataError.__module__}.DataError: "))
 
     def train_step(self, batch: Batch | None) -> Tensor:
         """One optimizer step on ``batch``, this process's share of it, None where that is nothing;
@@ -385,9 +399,21 @@ class Trainer:
         c = self.config
         before = (self.step - 1) // c.validate_every * c.validate_every  # the last validation
         first_settled = c.schedule == "cosine" and self.step >= SETTLED * c.steps > before
-        if first_settled or scores["valid_rollout_mse"] < self.best_score:
-            self.best_score = scores["valid_rollout_mse"]
+        score = scores["valid_rollout_mse"]
+        # Of those that collapsed the last is as good as any.
+        if first_settled or score < self.best_score or math.isinf(self.best_score):
+            self.best_score = score
             write_checkpoint(self.folder / BEST, self.checkpoint(resumable=False))
+
+
+@contextmanager
+def _workers_end_with(batches: object) -> Iterator[None]:
+    """End the workers behind an iterator of batches with the block. Torch does so when the iterator
+    goes, which the trace of an exception may keep, and at exit they would be waited for."""
+    try:
+        yield
+    finally:
+        getattr(batches, "_shutdown_workers", lambda: None)()
 
 
 class Log:
@@ -400,7 +426,7 @@ class Log:
         path = folder / LOG
         lines = read_log(path) if path.exists() else []
         kept = [json.dumps(line) + "\n" for line in lines if line["step"] <= step]
-        path.write_text("".join(kept))
+        replace_text(path, "".join(kept))
         self.file = path.open("a")
         self.board = SummaryWriter(folder / "tensorboard", purge_step=step + 1)
 

@@ -13,6 +13,15 @@ from adaptgns.rollout_file import RolloutFile
 Pairs = NDArray[np.int64]
 
 
+def unrecorded(file: RolloutFile) -> str | None:
+    """What a picture of the graph does not show, in words."""
+    if file.policy in ("fixed", "adaptive"):
+        return None
+    return (
+        f"the edges drawn are those within r: what the policy {file.policy} chose is not recorded"
+    )
+
+
 def next_graph(
     file: RolloutFile,
     positions: Floats,
@@ -23,11 +32,14 @@ def next_graph(
     ``positions`` ``[N, d]`` where the step before predicted ``sigma`` ``[N]``.
 
     There are none beyond it without a sigma, or under another policy than ``adaptive``: what the
-    others choose is not in the file.
+    others choose is not in the file (:func:`unrecorded`). A model without edges has none at all.
     """
     radius, box = file.graph_radius, file.metadata.box
+    none = np.empty((2, 0), dtype=np.int64)
+    if not file.has_edges:
+        return none, none
     if file.policy != "adaptive" or sigma is None:
-        return radius_graph(positions, radius, box=box), np.empty((2, 0), dtype=np.int64)
+        return radius_graph(positions, radius, box=box), none
     edges = adaptive_graph(
         positions, sigma, radius, file.tau, file.factor, box=box, eligible=mobile
     )

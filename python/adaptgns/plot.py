@@ -18,6 +18,7 @@ from rich.console import Console
 from adaptgns.animation import Animation
 from adaptgns.command import plain_errors
 from adaptgns.figures import write_figures
+from adaptgns.next_graph import unrecorded
 from adaptgns.rollout_file import RolloutFile
 from adaptgns.viewer import write_viewer
 from adaptgns.vtk_series import write_series
@@ -91,6 +92,7 @@ def animate(
             f"every, fps: got {every} and {fps}; accepted are every >= 1 and fps from 1 to 50"
         )
     with RolloutFile(rollout) as file:
+        _tell_unrecorded(file)
         Animation(file, file[trajectory], every).write(out, fps)
 
 
@@ -107,7 +109,13 @@ def vtk(rollout: Path, out: Path, *, trajectory: int = 0, every: int = 1) -> Non
     """Write one trajectory of a rollout file as VTK series into the folder ``out``, every
     ``every``-th step and the last; see :mod:`adaptgns.vtk_series`."""
     with RolloutFile(rollout) as file:
+        _tell_unrecorded(file)
         write_series(file, file[trajectory], out, every)
+
+
+def _tell_unrecorded(file: RolloutFile) -> None:
+    if (missing := unrecorded(file)) is not None:
+        Console(stderr=True).print(f"note: {missing}", highlight=False, soft_wrap=True)
 
 
 Config = AnimateConfig | ViewerConfig | FiguresConfig | VtkConfig

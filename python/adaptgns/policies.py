@@ -78,6 +78,8 @@ class Policy(Protocol):
     name: ClassVar[PolicyName]
     needs_sigma: ClassVar[bool]
     """Whether it takes a model with a variance head"""
+    looks_back: ClassVar[bool]
+    """Whether its edges depend on what the step before was predicted with"""
 
     def edges(self, state: State) -> Edges:
         """The edges of the step that starts in ``state``."""
@@ -89,6 +91,7 @@ class Fixed:
 
     name: ClassVar[PolicyName] = "fixed"
     needs_sigma: ClassVar[bool] = False
+    looks_back: ClassVar[bool] = False
 
     def edges(self, state: State) -> Edges:
         return state.base()
@@ -100,6 +103,7 @@ class Adaptive:
 
     name: ClassVar[PolicyName] = "adaptive"
     needs_sigma: ClassVar[bool] = True
+    looks_back: ClassVar[bool] = True
     rule: AdaptiveConfig
 
     def edges(self, state: State) -> Edges:
@@ -113,6 +117,7 @@ class TwoSided:
 
     name: ClassVar[PolicyName] = "two-sided"
     needs_sigma: ClassVar[bool] = True
+    looks_back: ClassVar[bool] = True
     rule: AdaptiveConfig
 
     def __post_init__(self) -> None:
@@ -130,6 +135,7 @@ class Acceleration:
 
     name: ClassVar[PolicyName] = "acceleration"
     needs_sigma: ClassVar[bool] = False
+    looks_back: ClassVar[bool] = False
     rule: AdaptiveConfig
 
     def edges(self, state: State) -> Edges:
@@ -147,6 +153,7 @@ class Divergence:
 
     name: ClassVar[PolicyName] = "divergence"
     needs_sigma: ClassVar[bool] = False
+    looks_back: ClassVar[bool] = False
     rule: AdaptiveConfig
 
     def edges(self, state: State) -> Edges:
@@ -170,6 +177,7 @@ class TwoPass:
 
     name: ClassVar[PolicyName] = "two-pass"
     needs_sigma: ClassVar[bool] = True
+    looks_back: ClassVar[bool] = False
     rule: AdaptiveConfig
 
     def edges(self, state: State) -> Edges:
@@ -184,6 +192,7 @@ class BaseSigma:
 
     name: ClassVar[PolicyName] = "base-sigma"
     needs_sigma: ClassVar[bool] = True
+    looks_back: ClassVar[bool] = True
     rule: AdaptiveConfig
     before: NDArray[np.float32] | None = None
     """``[N]``, sigma of the last step on the base graph; None before any"""
@@ -202,6 +211,7 @@ class Random:
 
     name: ClassVar[PolicyName] = "random"
     needs_sigma: ClassVar[bool] = True
+    looks_back: ClassVar[bool] = True  # goes on drawing
     rule: AdaptiveConfig
     rng: np.random.Generator
 
@@ -217,6 +227,7 @@ class NearestNeighbours:
 
     name: ClassVar[PolicyName] = "knn"
     needs_sigma: ClassVar[bool] = False
+    looks_back: ClassVar[bool] = False
     k: int
 
     def edges(self, state: State) -> Edges:

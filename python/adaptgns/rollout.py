@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
+from itertools import count as count_from
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from adaptgns.checkpoint import Checkpoint, read_checkpoint
 from adaptgns.command import plain_errors
 from adaptgns.config import HISTORY, RolloutConfig, to_json, torch_device
 from adaptgns.data.default import dataset_folder
+from adaptgns.data.errors import DataError
 from adaptgns.data.trajectories import Trajectories, Trajectory, open_split
 from adaptgns.network import Prediction
 from adaptgns.policies import Edges, Policy, State, make_policy
@@ -54,38 +55,23 @@ def steps(
     *,
     radius: float | None = None,
     teacher_forcing: bool = False,
+    every: int = 1,
 ) -> Iterator[Step]:
-    """The ``count`` steps that follow the first ``HISTORY`` frames of ``trajectory``.
+    """The ``count`` steps that follow the first ``HISTORY`` frames of ``trajectory``; a policy that
+    draws or remembers goes on from where it is.
 
-    ``radius`` changes the graph only: features stay divided by the radius the model was trained
-    with. With ``teacher_forcing`` every step starts from the true positions.
+    ``radius`` (length units of the data) changes the graph only: features stay divided by the
+    radius the model was trained with. With ``teacher_forcing`` every step starts from the true
+    positions, and of the steps only the first of ``every`` are returned; those between are made
+    where the policy looks back.
 
     Where the positions become infinite or NaN, those of all later steps are NaN.
 
     Raises ValueError for a trajectory or a policy that does not go with the model.
     """
-    if policy.needs_sigma and simulator.network.variance_head is None:
-        raise ValueError(
-            f"policy: got {policy.name}, which needs the model's variance; this model was trained "
-            "with the loss mse, which has none; accepted are fixed, knn, acceleration and "
-            "divergence"
-        )
-    if policy.name != "fixed" and not simulator.config.edges:
-        raise ValueError(
-            f"policy: got {policy.name}; this model has no edges and takes fixed alone"
-        )
-    dim = trajectory.positions.shape[2]
-    if dim != simulator.metadata.dim:
-        raise ValueError(
-            f"data: trajectory {trajectory.name} has {dim} dimensions; this model was trained on "
-            f"{simulator.metadata.dim}"
-        )
-    frames = len(trajectory.positions)
-    if not 0 < count <= frames - HISTORY:
-        raise ValueError(
-            f"count: {trajectory.name} has {frames} frames, so 1 to {frames - HISTORY} steps can "
-            f"follow the first {HISTORY}; got {count}"
-        )
+    _check(simulator, trajectory, policy, count)
+    if every > 1 and not teacher_forcing:
+        raise ValueError(f"every: got {every}; without teacher forcing 1 is accepted")
     device = simulator.lower.device
     true = torch.from_numpy(trajectory.positions).to(device)  # [T, N, d]
     particle_type = torch.from_numpy(trajectory.particle_type).to(device)
@@ -110,6 +96,10 @@ def steps(
         return sigma
 
     for index in range(HISTORY, HISTORY + count):
+        wanted = (index - HISTORY) % every == 0
+        if not (wanted or policy.looks_back):
+            window = torch.cat([window[:, 1:], true[index, :, None]], dim=1)
+            continue
         started = time.perf_counter()
         asking = 0.0
         edges = graph = None
@@ -134,19 +124,53 @@ def steps(
         error = prediction.acceleration - simulator.target(window, true[index])
         if prediction.variance is not None:
             sigma = to_sigma(prediction)
-        yield Step(
-            positions=positions,
-            sigma=sigma,
-            squared_error=error.square().sum(1).cpu().numpy(),
-            edges=0 if edges is None else directed_edges(edges, simulator.config.self_edges),
-            graph_ms=1e3 * (built - started - asking),
-            model_ms=1e3 * (finished - built + asking),
-        )
+        if wanted:
+            yield Step(
+                positions=positions,
+                sigma=sigma,
+                squared_error=error.square().sum(1).cpu().numpy(),
+                edges=0 if edges is None else directed_edges(edges, simulator.config.self_edges),
+                graph_ms=1e3 * (built - started - asking),
+                model_ms=1e3 * (finished - built + asking),
+            )
         if not (teacher_forcing or np.isfinite(positions).all()):
             yield from _lost(positions, sigma, index + 1 - HISTORY, count)
             return
         newest = true[index] if teacher_forcing else following
         window = torch.cat([window[:, 1:], newest[:, None]], dim=1)
+
+
+def _check(simulator: Simulator, trajectory: Trajectory, policy: Policy, count: int) -> None:
+    """Raise ValueError unless the policy and so many steps of the trajectory go with the model."""
+    if policy.needs_sigma and simulator.network.variance_head is None:
+        raise ValueError(
+            f"policy: got {policy.name}, which needs the model's variance; this model was trained "
+            "with the loss mse, which has none; accepted are fixed, knn, acceleration and "
+            "divergence"
+        )
+    given = trajectory.material_property
+    columns, known = 0 if given is None else given.shape[1], simulator.metadata.material_properties
+    if columns != known:
+        raise ValueError(
+            f"data: trajectory {trajectory.name} has {columns} material properties; this model was "
+            f"trained on {known}"
+        )
+    if policy.name != "fixed" and not simulator.config.edges:
+        raise ValueError(
+            f"policy: got {policy.name}; this model has no edges and takes fixed alone"
+        )
+    dim = trajectory.positions.shape[2]
+    if dim != simulator.metadata.dim:
+        raise ValueError(
+            f"data: trajectory {trajectory.name} has {dim} dimensions; this model was trained on "
+            f"{simulator.metadata.dim}"
+        )
+    frames = len(trajectory.positions)
+    if not 0 < count <= frames - HISTORY:
+        raise ValueError(
+            f"count: {trajectory.name} has {frames} frames, so 1 to {frames - HISTORY} steps can "
+            f"follow the first {HISTORY}; got {count}"
+        )
 
 
 def _lost(
@@ -187,7 +211,14 @@ def open_data(
 
     DataError where there is none, or none that the model can step forward.
     """
-    folder = dataset_folder(data or checkpoint.config.data)
+    try:
+        folder = dataset_folder(data or checkpoint.config.data)
+    except DataError as error:
+        if data is not None:
+            raise
+        raise DataError(
+            f"{error} (the checkpoint was trained on it; --data names where data are now)"
+        ) from error
     for note in checkpoint.metadata.check_suits(folder):
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
     return open_split(folder, split)
@@ -230,9 +261,11 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
     _check_neighbours(config, split, count)
     known = set(checkpoint.types or ())
     network = "GNS" if simulator.config.edges else "MLP"
+    other = simulator.config.edges and simulator.radius != simulator.metadata.radius
+    trained_at = f", trained at r = {simulator.radius:g}" if other else ""
     settings = {
         **to_json(config),
-        "label": f"{network} {checkpoint.config.loss}",
+        "label": f"{network} {checkpoint.config.loss}{trained_at}",
         "trained_radius": simulator.radius,
         "training": to_json(checkpoint.config),
         "training_steps": checkpoint.step,
@@ -262,12 +295,9 @@ def write_rollouts(config: RolloutConfig, console: Console) -> None:
                 make_policy(config.policy, config.adaptive, k=config.k, seed=config.seed + index)
                 for _ in range(2)
             )
-            one_step = enumerate(roll(policy=forced, teacher_forcing=True), start=HISTORY)
-            writer.add(
-                trajectory,
-                roll(policy=free),
-                islice(one_step, 0, None, config.one_step_every),
-            )
+            every = config.one_step_every
+            one_step = roll(policy=forced, teacher_forcing=True, every=every)
+            writer.add(trajectory, roll(policy=free), zip(count_from(HISTORY, every), one_step))
 
 
 def main(argv: Sequence[str] | None = None) -> None:

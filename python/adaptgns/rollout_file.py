@@ -319,6 +319,11 @@ class RolloutFile:
         return str(self.settings.get("policy", "fixed"))
 
     @property
+    def has_edges(self) -> bool:
+        """Whether the model has edges, as far as the settings tell."""
+        return bool(self.settings.get("training", {}).get("model", {}).get("edges", True))
+
+    @property
     def graph_radius(self) -> float:
         """Base radius of the graphs (length)."""
         for radius in (self.settings.get("radius"), self.settings.get("trained_radius")):

@@ -9,8 +9,8 @@ chosen, and a heat map drawn.
 
 from __future__ import annotations
 
+import hashlib
 import math
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ from rich.console import Console
 from rich.table import Table
 
 from adaptgns.atomic import write_json
-from adaptgns.checkpoint import read_checkpoint
+from adaptgns.checkpoint import checkpoint_file, read_checkpoint
 from adaptgns.command import plain_errors
 from adaptgns.config import HISTORY, AdaptiveConfig, Device, RuledPolicy, to_json, torch_device
 from adaptgns.data.trajectories import Trajectories
@@ -132,9 +132,9 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
     study = optuna.create_study(
         study_name="adaptgns",
         storage=_storage(config),
-        sampler=_sampler(config),
         load_if_exists=True,
     )
+    study.sampler = _sampler(config, begun=len(study.trials))
     _refuse_other(study, config)
 
     def objective(trial: optuna.Trial) -> float:
@@ -226,8 +226,8 @@ def _storage(config: SweepConfig) -> JournalStorage | RDBStorage:
     return JournalStorage(JournalFileBackend(str(config.out / JOURNAL)))
 
 
-def _sampler(config: SweepConfig) -> optuna.samplers.BaseSampler:
-    seed = config.seed + os.getpid()  # several processes draw different ones
+def _sampler(config: SweepConfig, *, begun: int) -> optuna.samplers.BaseSampler:
+    seed = config.seed + begun  # so that several processes draw different ones
     match config.sampler:
         case "tpe":
             return optuna.samplers.TPESampler(seed=seed)
@@ -247,8 +247,11 @@ def _suggest(
 
 def _refuse_other(study: optuna.Study, config: SweepConfig) -> None:
     """Trials of one journal must be comparable."""
-    asked = to_json(config)
-    local = ("out", "trials", "storage", "device", "edges", "seed")
+    weights = hashlib.sha256(checkpoint_file(config.checkpoint).read_bytes()).hexdigest()
+    asked = to_json(config) | {"weights": weights[:16]}
+    local = ["checkpoint", "out", "trials", "storage", "device", "edges"]
+    if config.policy != "random":
+        local.append("seed")
     asked = {name: value for name, value in asked.items() if name not in local}
     asked = {name: list(v) if isinstance(v, tuple) else v for name, v in asked.items()}
     begun = study.user_attrs.get("config")

@@ -133,11 +133,15 @@ def _last_checkpoint(folder: Path) -> Checkpoint:
 def _take(arguments: list[str], option: str) -> tuple[str | None, list[str]]:
     """The value of ``option`` (as ``--option value`` or ``--option=value``) and the other
     arguments."""
-    for index, argument in enumerate(arguments):
-        if argument == option and index + 1 < len(arguments):
-            return arguments[index + 1], arguments[:index] + arguments[index + 2 :]
-        if argument.startswith(option + "="):
-            return argument.split("=", 1)[1], arguments[:index] + arguments[index + 1 :]
+    given = [i for i, a in enumerate(arguments) if a == option or a.startswith(option + "=")]
+    if len(given) > 1:
+        raise ValueError(f"{option}: got it {len(given)} times; accepted is once")
+    for index in given:
+        before, (argument, *after) = arguments[:index], arguments[index:]
+        if argument != option:
+            return argument.split("=", 1)[1], before + after
+        if after:
+            return after[0], before + after[1:]
     return None, arguments
 
 
@@ -152,6 +156,9 @@ def train(config: TrainConfig, folder: Path, console: Console, group: Processes)
         torch.set_num_threads(threads)
     with group.first_ahead():  # to make or complete what all read, and to tell what is wrong
         data = dataset_folder(config.data)
+        own = data == Path(config.data)
+        if own:  # which the checkpoints name, wherever they are used from
+            config = replace(config, data=str(data.resolve()))
         metadata = read_metadata(data)
         if checkpoint is not None and metadata != checkpoint.metadata:
             raise ValueError(
@@ -182,7 +189,7 @@ def train(config: TrainConfig, folder: Path, console: Console, group: Processes)
         f"{trainer.device.type}; run folder {folder}",
         highlight=False,
     )
-    if data == Path(config.data) and checkpoint is None:
+    if own and checkpoint is None:
         _tell_assumptions(config, metadata, console)
     trainer.run(console)
     return data

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from adaptgns.config import HISTORY, TrainConfig
 from adaptgns.data.trajectories import Trajectories
 from adaptgns.losses import training_loss
-from adaptgns.metrics import position_mse
+from adaptgns.metrics import edge_counts, position_mse
 from adaptgns.policies import Fixed
 from adaptgns.rollout import steps
 from adaptgns.simulator import Simulator
@@ -21,7 +21,7 @@ ONE_STEP_WINDOWS = 64
 """Windows, evenly spread over the split, of the one-step figures"""
 MARKS = (50, 100, 200)
 COLLAPSED = 20
-"""How many times the edges of the first step mean that a rollout has collapsed"""
+"""How many times the true edges, or the particles, mean that a rollout has collapsed"""
 
 
 @dataclass(frozen=True)
@@ -73,20 +73,23 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
     for index in range(min(len(valid), config.validate_trajectories)):
         trajectory = valid[index]
         true = trajectory.positions[HISTORY:][: config.validate_horizon]
-        mobile = simulator.metadata.mobile(trajectory.particle_type)
+        mobile, box = simulator.metadata.mobile(trajectory.particle_type), simulator.metadata.box
+        everyone = np.ones_like(mobile)
         predicted: list[NDArray[np.float32]] = []
         sigmas: list[NDArray[np.float32]] = []
-        edges = 0
-        for step in steps(simulator, trajectory, Fixed(), len(true)):
+        most = 0.0
+        for number, step in enumerate(steps(simulator, trajectory, Fixed(), len(true))):
             predicted.append(step.positions)
             if step.sigma is not None:
                 sigmas.append(step.sigma)
-            edges = edges or step.edges
-            if step.edges > COLLAPSED * edges:
-                break
+            if step.edges > most:
+                there = edge_counts(true[[number]], simulator.radius, everyone, box)[0]
+                most = max(most, COLLAPSED * max(there, len(mobile)))
+                if step.edges > most:
+                    break
         curve = np.full(len(true), np.inf)
         curve[: len(predicted)] = position_mse(
-            np.stack(predicted), true[: len(predicted)], mobile, simulator.metadata.box
+            np.stack(predicted), true[: len(predicted)], mobile, box
         )
         curves.append(curve)
         shown = shown or (true, np.stack(predicted), np.stack(sigmas) if sigmas else None, mobile)

@@ -7,8 +7,9 @@ the result of step k; its time is k·dt. Positions in 2D get z = 0.
 Fields of the points: ``velocity`` (length per time), ``speed``, ``particle_type``; of the
 prediction also ``error``, the distance to the truth, and ``sigma`` (normalized; NaN in frame 0,
 which nothing predicted). Fields of the lines: ``extra``, 1 for those beyond the base radius, and
-``length``. The graph is that of the step which starts from the frame. Lines that run through a
-periodic boundary are left out: they would cross the picture.
+``length``. The graph is that of the step which starts from the frame, under other policies than
+``fixed`` and ``adaptive`` the base graph. Lines that run through a periodic boundary are left out:
+they would cross the picture.
 """
 
 from __future__ import annotations

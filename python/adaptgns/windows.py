@@ -277,8 +277,14 @@ def training_batches(
     )
 
 
+TO_SAVE = 60
+"""Seconds that a worker outlives SIGTERM"""
+
+
 def _begin_worker(_: int) -> None:
-    """A worker is one thread, and leaves Ctrl-C, which reaches every process of the terminal, to
-    its parent, who saves and ends its workers."""
+    """A worker is one thread, and leaves signals that reach the whole group of processes, Ctrl-C
+    and a scheduler's SIGTERM, to its parent, who saves and ends its workers; should it not, a
+    worker ends by itself."""
     divide_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: signal.alarm(TO_SAVE))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import random
 import shutil
 import signal
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 
+from adaptgns import rollout
 from adaptgns.checkpoint import LAST, read_checkpoint
 from adaptgns.config import to_json
 from adaptgns.presets import PRESETS
@@ -239,6 +241,51 @@ def test_killed_ten_times_and_resumed_equals_uninterrupted(drops: Path, tmp_path
     assert a.step == b.step == 300
     assert a.tensors.keys() == b.tensors.keys()
     assert all(torch.equal(a.tensors[name], b.tensors[name]) for name in a.tensors)
+
+
+def test_a_signal_to_all_processes_leaves_the_workers_alive_until_all_is_saved(
+    drops: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    options = ["--preset", "smoke", "--data", drops, "--steps", 100_000, "--workers", 1]
+    process = subprocess.Popen(
+        command(*options, "--checkpoint-every", 100_000, "--out", folder),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    log = folder / "metrics.jsonl"
+    while not (log.exists() and log.read_text()):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGTERM)
+    out, errors = process.communicate(timeout=60)
+    step = read_checkpoint(folder / LAST).step
+    assert f"stopped by SIGTERM after step {step}; nothing is lost" in out, errors
+
+
+def test_a_run_names_its_data_wherever_it_is_used_from(
+    drops: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(drops, tmp_path / "here" / "my_data")
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    main(["--preset", "smoke", "--data", "my_data", "--out", "run", "--steps", "2"])
+    monkeypatch.chdir(tmp_path / "there")
+    options = ["--checkpoint", str(tmp_path / "here" / "run"), "--steps", "1"]
+    rollout.main([*options, "--out", "one.h5"])
+    (tmp_path / "here" / "my_data").rename(tmp_path / "moved")
+    rollout.main([*options, "--out", "two.h5", "--data", str(tmp_path / "moved")])
+    with pytest.raises(SystemExit):
+        rollout.main([*options, "--out", "three.h5"])
+    assert "--data names where data are now" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("option", ["--preset", "--config", "--resume"])
+def test_what_a_run_starts_from_is_named_once(option: str) -> None:
+    with pytest.raises(ValueError, match=f"{option}: got it 2 times; accepted is once"):
+        parse([option, "smoke", "--seed", "1", f"{option}=paper"])
 
 
 def test_a_saved_configuration_starts_a_run_of_its_own(tmp_path: Path) -> None:

@@ -109,6 +109,19 @@ def test_unknown_keys_and_wrong_kinds_are_refused(small_config: TrainConfig) -> 
         from_json(TrainConfig, values | {"loss": "mae"}, source="x")
     with pytest.raises(ConfigError, match="batch: got 0; accepted are whole numbers >= 1"):
         from_json(TrainConfig, values | {"batch": 0}, source="x")
+    for name, value, accepted in (
+        ("mirror", "false", "type bool"),
+        ("steps", 99.9, "type int"),
+        ("steps", True, "type int"),
+        ("lr", "1", "type float"),
+        ("data", None, "type str"),
+        ("out", 3, "type str"),
+        ("loss", "mae", "nll, beta-nll, decoupled, mse"),
+        ("model", [], "an object is accepted"),
+    ):
+        with pytest.raises(ConfigError, match=rf"x: .*{accepted} @ \$\.{name}"):
+            from_json(TrainConfig, values | {name: value}, source="x")
+    assert from_json(TrainConfig, values | {"lr": 1}, source="x").lr == 1.0
 
 
 @pytest.mark.parametrize(

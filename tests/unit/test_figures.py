@@ -101,6 +101,12 @@ def test_runs_differ_in_colour_and_policies_in_dash(
     assert legend(drawn(run)["pareto"]) == ["GNS nll, fixed", "GNS nll, adaptive"]
 
 
+def test_a_policy_of_ones_own_is_drawn(tmp_path: Path, metadata: Metadata) -> None:
+    file = write_rollout(tmp_path / "own" / "mine.h5", metadata, policy="mine")
+    evaluate([file], out=tmp_path / "own")
+    assert len(write_figures([tmp_path / "own"], tmp_path / "out")) > 2
+
+
 def test_radii_differ_in_colour(tmp_path: Path, metadata: Metadata) -> None:
     files = [
         write_rollout(tmp_path / f"{radius}.h5", metadata, radius=radius)

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import signal
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,17 +16,20 @@ import pytest
 import torch
 from rich.console import Console
 
-from adaptgns import fit
+from adaptgns import fit, validation
 from adaptgns.checkpoint import BEST, LAST, build_simulator, read_checkpoint
 from adaptgns.config import AdaptiveConfig, Precision, TrainConfig
+from adaptgns.data import Trajectory
+from adaptgns.data.dataset import write_dataset
+from adaptgns.data.errors import DataError
 from adaptgns.data.metadata import read_metadata
 from adaptgns.data.trajectories import open_split
 from adaptgns.fit import Trainer, TrainingStopped
-from adaptgns.graph import adaptive_graph
+from adaptgns.graph import adaptive_graph, radius_graph
 from adaptgns.network import Prediction
 from adaptgns.policies import Adaptive
 from adaptgns.processes import Processes
-from adaptgns.rollout import steps, to_sigma
+from adaptgns.rollout import Step, steps, to_sigma
 from adaptgns.segment import Graph
 from tests.conftest import graph_of
 
@@ -224,6 +228,65 @@ def test_signals_save_and_say_how_to_go_on(
     with pytest.raises(TrainingStopped, match=rf"{number.name} after step 6.*\n.*--resume"):
         run.run(QUIET)
     assert read_checkpoint(tmp_path / LAST).step == 6
+
+
+def test_what_a_worker_cannot_read_is_told_in_one_line_and_nothing_is_lost(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreadable(*_: object) -> None:
+        raise DataError("train.h5: gone")
+
+    run = trainer(drops, tmp_path, replace(small_config, workers=1))
+    monkeypatch.setattr(fit.Windows, "collate_share", unreadable)
+    with pytest.raises(DataError, match=r"^train\.h5: gone$"):
+        run.run(QUIET)
+    assert read_checkpoint(tmp_path / LAST).step == 0
+
+
+def test_only_what_collapsed_is_stopped(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not what began without a neighbour and came together as it should."""
+    metadata = read_metadata(drops)
+    spread = np.random.default_rng(0).uniform(-0.1, 0.1, (300, 2))
+
+    def falling(closest: float) -> Trajectory:
+        scale = np.maximum(10 - np.arange(30.0), closest)[:, None, None]
+        positions = (0.5 + scale * spread).astype(np.float32)
+        return Trajectory("", positions, np.full(300, 5))
+
+    rain, pile = falling(1.0), falling(0.01)
+    write_dataset(
+        tmp_path / "rain", {"train": [rain], "valid": [rain], "test": [rain]}, dt=metadata.dt,
+        bounds=metadata.bounds, radius=metadata.radius,
+    )  # fmt: skip
+    run = trainer(drops, tmp_path / "run", replace(small_config, validate_horizon=20))
+    valid = open_split(tmp_path / "rain", "valid")
+    for predicted, collapsed in ((rain, False), (pile, True)):
+
+        def rolled(*_: object, predicted: Trajectory = predicted) -> Iterator[Step]:
+            for positions in predicted.positions[6:26]:
+                edges = radius_graph(positions, metadata.radius).shape[1]
+                yield Step(positions, None, np.zeros(300, np.float32), edges, 0.0, 0.0)
+
+        monkeypatch.setattr(validation, "steps", rolled)
+        score = validation.validate(run.simulator, valid, run.config).scores
+        assert np.isinf(score["valid_rollout_mse"]) == collapsed
+
+
+def test_where_all_collapsed_the_last_is_kept(
+    drops: Path, tmp_path: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = trainer(drops, tmp_path, replace(small_config, schedule="exponential"))
+    true = validation.validate
+
+    def collapsed(*arguments: Any) -> validation.Validation:
+        made = true(*arguments)
+        return replace(made, scores=made.scores | {"valid_rollout_mse": np.inf})
+
+    monkeypatch.setattr(fit, "validate", collapsed)
+    run.run(QUIET)
+    assert read_checkpoint(tmp_path / BEST).step == small_config.steps
 
 
 class Two(Processes):

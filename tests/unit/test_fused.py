@@ -298,7 +298,7 @@ def test_what_does_not_fit_is_refused(change: dict, kind: type[Exception], messa
 def test_what_does_not_fit_in_memory_is_told_before_it_begins() -> None:
     wide = linear(1_000_000, 1)
     rows = np.zeros((10_000_000, 1), np.float32)
-    with pytest.raises(MemoryError, match="takes at least 40000000000000 bytes .* holds"):
+    with pytest.raises(MemoryError, match=r"takes at least 40000000000000 bytes .* holds"):
         network_forward([wide], rows, None, heads=0, keep=False)
 
 

@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -31,7 +32,8 @@ from adaptgns.data.errors import DataError
 from adaptgns.data.metadata import Metadata, read_metadata, write_metadata
 from adaptgns.data.trajectories import Trajectory, open_split
 from adaptgns.policies import Adaptive, Edges, Fixed, State, make_policy
-from adaptgns.rollout import main, steps, write_rollouts
+from adaptgns.rollout import Step, main, steps, write_rollouts
+from adaptgns.rollout_file import RolloutFile
 from adaptgns.simulator import Simulator
 
 RULE = AdaptiveConfig(tau=70, factor=1.5)
@@ -95,7 +97,7 @@ def test_base_sigma_is_that_of_the_fixed_graph_one_step_ago(
     seen: list[tuple[State, Edges]] = []
 
     class Spy:
-        name, needs_sigma = policy.name, policy.needs_sigma
+        name, needs_sigma, looks_back = policy.name, policy.needs_sigma, policy.looks_back
 
         def edges(self, state: State) -> Edges:
             edges = policy.edges(state)
@@ -132,6 +134,22 @@ def test_random_is_seeded(simulator: Simulator, trajectory: Trajectory) -> None:
         return [s.edges for s in steps(simulator, trajectory, policy, 8, teacher_forcing=True)]
 
     assert edges(1) == edges(1) != edges(2)
+
+
+@pytest.mark.parametrize("name", get_args(PolicyName))
+def test_single_steps_now_and_then_are_those_of_all(
+    simulator: Simulator, trajectory: Trajectory, name: PolicyName
+) -> None:
+    def forced(every: int) -> list[Step]:
+        policy = make_policy(name, RULE, k=4, seed=0)
+        return list(steps(simulator, trajectory, policy, 8, teacher_forcing=True, every=every))
+
+    for one, other in zip(forced(1)[::3], forced(3), strict=True):
+        assert one.edges == other.edges
+        np.testing.assert_array_equal(one.positions, other.positions)
+        np.testing.assert_array_equal(one.squared_error, other.squared_error)
+    with pytest.raises(ValueError, match="every: got 2; without teacher forcing 1 is accepted"):
+        next(steps(simulator, trajectory, Fixed(), 8, every=2))
 
 
 def test_knn_has_k_senders_each(simulator: Simulator, trajectory: Trajectory) -> None:
@@ -356,6 +374,33 @@ def test_types_that_the_model_was_not_trained_on_are_told(
         main([*options, "--split", "train", "--steps", "1", "--out", str(tmp_path / model)])
         message = "has particles of type 5; the model was trained on type 6 alone"
         assert capsys.readouterr().out.count(message) == told
+
+
+def test_what_a_model_was_trained_at_is_in_its_name(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    metadata = read_metadata(drops)
+    labels = []
+    for radius in (None, 0.02):
+        model = replace(small_config.model, radius=radius)
+        config = replace(small_config, model=model, data=str(drops))
+        tensors = with_prefix("model", build_simulator(config, metadata).state_dict())
+        write_checkpoint(tmp_path / BEST, Checkpoint(config, metadata, 1, 0.1, tensors))
+        out = tmp_path / f"{radius}.h5"
+        write_rollouts(RolloutConfig(tmp_path, out, steps=1, device="cpu"), Console(quiet=True))
+        with RolloutFile(out) as file:
+            labels.append(file.label)
+    assert labels == ["GNS nll", "GNS nll, trained at r = 0.02"]
+
+
+def test_other_material_properties_than_the_models_are_refused(
+    simulator: Simulator, trajectory: Trajectory
+) -> None:
+    other = replace(
+        trajectory, material_property=np.zeros((len(trajectory.particle_type), 2), np.float32)
+    )
+    with pytest.raises(ValueError, match="has 2 material properties; this model was trained on 0"):
+        next(steps(simulator, other, Fixed(), 1))
 
 
 def test_a_horizon_behind_the_end_of_the_data_is_told(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -10,6 +11,7 @@ from typing import get_args
 import pytest
 from rich.console import Console
 
+from adaptgns.checkpoint import BEST
 from adaptgns.config import AdaptiveConfig, RolloutConfig, RuledPolicy
 from adaptgns.evaluate import measure as evaluate
 from adaptgns.rollout import write_rollouts
@@ -68,6 +70,12 @@ def test_what_was_tried_is_not_tried_again(
     assert sweep(config, QUIET)["trials"] == second["trials"]
     with pytest.raises(ValueError, match="holds trials with other steps"):
         sweep(replace(config, steps=4), QUIET)
+    moved = config.out.with_name("moved")
+    shutil.copytree(config.checkpoint, moved)
+    assert sweep(replace(config, checkpoint=moved), QUIET)["trials"] == second["trials"]
+    (moved / BEST).unlink()  # so that the last is taken, which holds more
+    with pytest.raises(ValueError, match="holds trials with other weights"):
+        sweep(replace(config, checkpoint=moved), QUIET)
 
 
 def test_journals_that_name_no_policy_are_of_the_adaptive_one(
@@ -101,6 +109,13 @@ def test_any_rule_can_be_searched(config: SweepConfig, run: Path, policy: RuledP
     scalars = evaluate([rollout.out], (config.steps,)).to_json()["rollouts"][0]["scalars"]
     for name, scalar in (("mse", f"mse@{config.steps}"), ("edges", "edges_per_step")):
         assert row[name] == pytest.approx(scalars[scalar]["mean"], rel=1e-5)
+
+
+def test_random_rules_are_of_a_seed(config: SweepConfig) -> None:
+    config = replace(config, policy="random", trials=1)
+    sweep(config, QUIET)
+    with pytest.raises(ValueError, match="holds trials with other seed"):
+        sweep(replace(config, seed=5), QUIET)
 
 
 def test_only_priors_do_without_a_variance(
@@ -172,6 +187,8 @@ def test_samplers_that_draw_stay_within_the_ranges(config: SweepConfig, sampler:
         assert 1.1 <= row["factor"] <= 1.5
         assert 0.012 <= row["radius"] <= 0.015
     assert len({row["factor"] for row in trials}) == 3
+    again = replace(drawn, out=drawn.out.with_name("again"))
+    assert [row["tau"] for row in sweep(again, QUIET)["trials"]] == [row["tau"] for row in trials]
 
 
 def test_a_value_named_twice_is_refused(config: SweepConfig) -> None:

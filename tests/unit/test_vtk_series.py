@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -107,6 +108,24 @@ def test_lines_are_the_graph_of_the_next_step(
     vtk(fixed, tmp_path / "fixed", every=7)
     assert pairs(read(tmp_path / "fixed", "graph", 7), 0) == base
     assert "sigma" not in read(tmp_path / "fixed", "prediction", 7).point_data
+
+
+def test_what_the_file_does_not_tell_is_said(
+    tmp_path: Path, metadata: Metadata, adaptive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    vtk(adaptive, tmp_path / "adaptive", every=7)
+    assert not capsys.readouterr().err
+    nearest = write_rollout(tmp_path / "knn.h5", metadata, policy="knn")
+    vtk(nearest, tmp_path / "knn", every=7)
+    assert "what the policy knn chose is not recorded" in capsys.readouterr().err
+    assert pairs(read(tmp_path / "knn", "graph", 7), 0)
+    alone = write_rollout(tmp_path / "mlp.h5", metadata, sigma=False)
+    with h5py.File(alone, "r+") as file:
+        settings = json.loads(file.attrs["settings"])
+        settings["training"] = {"model": {"edges": False}}
+        file.attrs["settings"] = json.dumps(settings)
+    vtk(alone, tmp_path / "mlp", every=7)
+    assert not pairs(read(tmp_path / "mlp", "graph", 7), 0)
 
 
 def test_lines_through_a_periodic_boundary_are_left_out(tmp_path: Path, metadata: Metadata) -> None:
