@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count as count_from
 
@@ -205,9 +205,9 @@ def directed_edges(edges: Edges, self_edges: bool) -> int:
 
 def open_data(
     checkpoint: Checkpoint, data: str | None, split: str, console: Console
-) -> Trajectories:
-    """A split of ``data``, or of what the model was trained on; tells what the model takes to be
-    otherwise than it is there.
+) -> tuple[Simulator, Trajectories]:
+    """A split of ``data``, or of what the model was trained on, and the simulator in the bounds
+    there; tells what the model takes to be otherwise.
 
     DataError where there is none, or none that the model can step forward.
     """
@@ -219,9 +219,10 @@ def open_data(
         raise DataError(
             f"{error} (the checkpoint was trained on it; --data names where data are now)"
         ) from error
-    for note in checkpoint.metadata.check_suits(folder):
+    metadata, notes = checkpoint.metadata.suited(folder, split)
+    for note in notes:
         console.print(f"note: {note}", highlight=False, soft_wrap=True)
-    return open_split(folder, split)
+    return replace(checkpoint, metadata=metadata).simulator(), open_split(folder, split)
 
 
 def tell_short(
@@ -253,9 +254,9 @@ def _check_neighbours(config: RolloutConfig, split: Trajectories, count: int) ->
 def write_rollouts(config: RolloutConfig, console: Console) -> None:
     """Roll out the trajectories that ``config`` asks for, and write them to ``config.out``."""
     checkpoint = read_checkpoint(config.checkpoint)
-    simulator = checkpoint.simulator().to(torch_device(config.device))
+    simulator, split = open_data(checkpoint, config.data, config.split, console)
+    simulator = simulator.to(torch_device(config.device))
     simulator.network.precision = config.precision
-    split = open_data(checkpoint, config.data, config.split, console)
     count = len(split) if config.trajectories is None else min(config.trajectories, len(split))
     tell_short(split, count, config.steps, console)
     _check_neighbours(config, split, count)

@@ -121,8 +121,8 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
     within the budget.
     """
     checkpoint = read_checkpoint(config.checkpoint)
-    simulator = checkpoint.simulator().to(torch_device(config.device))
-    split = open_data(checkpoint, config.data, config.split, console)
+    simulator, split = open_data(checkpoint, config.data, config.split, console)
+    simulator = simulator.to(torch_device(config.device))
     tell_short(split, config.trajectories, config.steps, console)
     config = replace(config, radius=config.radius or (simulator.radius,))
     space = {"tau": config.tau, "factor": config.factor, "radius": config.radius}

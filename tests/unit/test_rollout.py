@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -331,19 +333,49 @@ def test_wrong_options_are_told_plainly(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_data_must_suit_the_model(drops: Path, tmp_path: Path) -> None:
     metadata = read_metadata(drops)
-    assert metadata.check_suits(drops) == []
+    assert metadata.suited(drops, "test") == (metadata, [])
     for change, told in (
         ({"periodic": (True, False)}, "periodic is (False, False); the model was"),
         ({"material_properties": 1}, "material_properties is 0; the model was trained with 1"),
     ):
         with pytest.raises(DataError, match=re.escape(told)):
-            replace(metadata, **change).check_suits(drops)
+            replace(metadata, **change).suited(drops, "test")
     faster = replace(metadata, dt=0.01, velocity_std=(1.0, 1.0))
-    assert faster.check_suits(drops) == [
-        f"{drops}: dt is {metadata.dt}; the model goes by 0.01, with which it was trained"
-    ]
-    (note,) = metadata.check_suits(tmp_path)
+    assert faster.suited(drops, "test") == (
+        faster,
+        [f"{drops}: dt is {metadata.dt}; the model goes by 0.01, with which it was trained"],
+    )
+    same, (note,) = metadata.suited(tmp_path, "test")
+    assert same == metadata
     assert "there is no metadata.json" in note
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_walls_are_those_of_the_data(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], apart: bool
+) -> None:
+    """``apart``: in geoelements/gns' section for the test data."""
+    content = json.loads((drops / "metadata.json").read_text())
+    wider = content | {"bounds": [[0.1, 1.7], [0.1, 0.9]]}
+    other = tmp_path / "other"
+    shutil.copytree(drops, other)
+    with h5py.File(other / "test.h5", "r+") as file:
+        for trajectory in file.values():  # through the wall, if there were one
+            time = np.arange(len(trajectory["position"]))[:, None]
+            trajectory["position"][..., 0] = trajectory["position"][:1, :, 0] + 0.03 * time
+    write_metadata(other, {"train": content, "rollout": wider} if apart else wider)
+    options = ["--checkpoint", "waterdrop", "--data", str(other), "--trajectories", "1"]
+    farthest = []
+    for split in ("test", "valid"):
+        out = tmp_path / f"{split}.h5"
+        main([*options, "--split", split, "--out", str(out)])
+        told = "bounds are ((0.1, 1.7), (0.1, 0.9)); the model was trained in ((0.1, 0.9)"
+        assert (told in capsys.readouterr().out) == (split == "test" or not apart)
+        with RolloutFile(out) as file:
+            farthest.append(file[0].predicted[..., 0].max())
+            assert (file.metadata.bounds[0][1] == 1.7) == (split == "test" or not apart)
+    assert farthest[0] > 0.95
+    assert farthest[1] <= 0.9
 
 
 def test_what_the_model_takes_otherwise_is_told(

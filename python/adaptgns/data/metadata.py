@@ -6,7 +6,7 @@ import json
 import math
 import os
 import warnings
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,19 +67,23 @@ class Metadata:
         """Which particles of these types `[N]` are not kinematic, bool `[N]`."""
         return ~np.isin(particle_type, self.kinematic_types)
 
-    def check_suits(self, folder: Path) -> list[str]:
-        """What a user should know who gives a model that was trained on this the data in `folder`:
-        in what they differ, statistics of motion apart, which a rollout doesn't need.
+    def suited(self, folder: Path, split: str) -> tuple[Metadata, list[str]]:
+        """What a model that was trained on this goes by in rollouts of a split of `folder`: this,
+        with the bounds there, which geoelements/gns may state apart for its test data. And what a
+        user should know: in what they differ, statistics of motion apart, which a rollout doesn't
+        need.
 
         Raises:
             DataError: they differ in what a model can't do without, or `metadata.json` is wrong.
         """
         if not (folder / FILE_NAME).exists():
-            return [
-                f"{folder}: there is no {FILE_NAME} that tells whether the model suits the data"
-            ]
-        section = training_section(_load(folder / FILE_NAME))
-        notes = []
+            note = f"{folder}: there is no {FILE_NAME} that tells whether the model suits the data"
+            return self, [note]
+        content = _load(folder / FILE_NAME)
+        section = training_section(content)
+        if split == "test" and isinstance(content.get("rollout"), dict):
+            section = section | content["rollout"]
+        notes, bounds = [], self.bounds
         for name, given in _setting(section, folder).items():
             trained = getattr(self, name)
             if given == trained:
@@ -89,11 +93,15 @@ class Metadata:
                     f"{folder}: {name} is {given}; the model was trained with {trained} and "
                     "accepts no other"
                 )
-            notes.append(
-                f"{folder}: {name} is {given}; the model goes by {trained}, with which it was "
-                "trained"
-            )
-        return notes
+            if name == "bounds":
+                bounds = given
+                notes.append(f"{folder}: bounds are {given}; the model was trained in {trained}")
+            else:
+                notes.append(
+                    f"{folder}: {name} is {given}; the model goes by {trained}, with which it was "
+                    "trained"
+                )
+        return replace(self, bounds=bounds), notes
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that `from_json` reads back exactly."""
