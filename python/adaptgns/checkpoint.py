@@ -72,6 +72,24 @@ def build_simulator(config: TrainConfig, metadata: Metadata) -> Simulator:
     )
 
 
+def take_weights(simulator: Simulator, path: Path) -> list[str]:
+    """Give ``simulator`` the weights of the checkpoint ``path``; the names of those that it lacks,
+    which stay as they were.
+
+    CheckpointError where any are of other shapes.
+    """
+    own, given = simulator.state_dict(), read_checkpoint(path).group("model")
+    taken = {name: weights for name, weights in given.items() if name in own}
+    for name, weights in taken.items():
+        if (there := list(weights.shape)) != (here := list(own[name].shape)):
+            raise CheckpointError(
+                f"checkpoint {path}: {name} has the shape {there}, in this model {here}; accepted "
+                "is one with the same --model options, dimensions and material properties"
+            )
+    simulator.load_state_dict(own | taken)
+    return [name for name in own if name not in taken]
+
+
 def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """``tensors`` named as a group of a checkpoint."""
     return {f"{prefix}.{name}": tensor.detach().contiguous() for name, tensor in tensors.items()}

@@ -185,6 +185,9 @@ class TrainConfig:
     """Which set of defaults all other options start from."""
     resume: Path | None = None
     """Go on with the run in this folder, with the configuration saved there."""
+    init: Path | None = None
+    """Begin with the weights of this checkpoint, of the same --model options: a run folder, a
+    .safetensors file, or waterdrop or sand."""
     model: ModelConfig = field(default_factory=ModelConfig)
     adaptive: AdaptiveConfig = field(default_factory=AdaptiveConfig)
     loss: Loss = "nll"

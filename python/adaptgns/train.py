@@ -17,7 +17,7 @@ import tyro
 from rich.console import Console
 
 from adaptgns.atomic import read_json, replace_text
-from adaptgns.checkpoint import LAST, Checkpoint, checkpoint_file, read_checkpoint
+from adaptgns.checkpoint import LAST, Checkpoint, checkpoint_file, read_checkpoint, take_weights
 from adaptgns.command import plain_errors
 from adaptgns.config import (
     PolicyName,
@@ -181,6 +181,10 @@ def train(config: TrainConfig, folder: Path, console: Console, group: Processes)
             checkpoint=checkpoint,
             processes=group,
         )
+    if checkpoint is None and config.init is not None:
+        kept = take_weights(trainer.simulator, config.init)
+        left = f"; {len(kept)} weights begin anew: {', '.join(kept)}" if kept else ""
+        console.print(f"begins with the weights of {config.init}{left}", highlight=False)
     if group.first:
         replace_text(folder / CONFIG, json.dumps(to_json(config), indent=1))
     console.print(

@@ -282,6 +282,29 @@ def test_a_run_names_its_data_wherever_it_is_used_from(
     assert "--data names where data are now" in " ".join(capsys.readouterr().err.split())
 
 
+def test_a_run_may_begin_with_the_weights_of_another(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    options = ["--preset", "smoke", "--data", str(drops)]
+    main([*options, "--loss", "mse", "--steps", "3", "--out", str(first)])
+    few = ["--steps", "1", "--lr", "1e-12", "--warmup", "0"]
+    capsys.readouterr()
+    main([*options, *few, "--init", str(first), "--out", str(second)])
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"begins with the weights of {first}; " in told
+    assert "weights begin anew: network.variance_head." in told
+    before, after = (read_checkpoint(folder / LAST).group("model") for folder in (first, second))
+    for name, weights in before.items():
+        torch.testing.assert_close(after[name], weights, msg=name)
+    assert set(after) > set(before)
+    main(["--resume", str(second), "--steps", "2"])  # which does not begin again
+    assert read_checkpoint(second / LAST).step == 2
+    with pytest.raises(SystemExit):
+        main([*options, "--init", "waterdrop", "--model.latent", "8", "--out", str(tmp_path / "x")])
+    assert "has the shape [64], in this model [8]" in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize("option", ["--preset", "--config", "--resume"])
 def test_what_a_run_starts_from_is_named_once(option: str) -> None:
     with pytest.raises(ValueError, match=f"{option}: got it 2 times; accepted is once"):
