@@ -155,6 +155,16 @@ def test_statistics_of_other_data_are_told(tmp_path: Path, metadata: Metadata) -
     assert not problems_of(tmp_path, replace(metadata, **(vars(found) | ones)), "train")
 
 
+def test_forces_in_a_file_of_their_own_are_told_once(tmp_path: Path, wide: Metadata) -> None:
+    (tmp_path / "force.py").write_text("raise SystemExit")  # which nobody runs
+    for split, count in (("train", 1), ("test", 0)):
+        save(tmp_path / f"{split}.h5", inside())
+        problems = list(find_problems(open_split(tmp_path, split), wide))
+        assert not any(problem.fatal for problem in problems)
+        told = [each for each in problems if "force.py: LagrangeBench takes" in each.message]
+        assert len(told) == count
+
+
 def test_a_trajectory_without_anything_to_predict_is_refused(
     tmp_path: Path, metadata: Metadata
 ) -> None:

@@ -48,7 +48,7 @@ def test_every_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         pytest.importorskip("torch_geometric")
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```(\w+)\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
-    assert [kind for kind, _ in blocks].count("python") == 4
+    assert [kind for kind, _ in blocks].count("python") == 5
     scope: dict[str, object] = {}
     for kind, text in blocks:
         if kind == "python":

@@ -88,7 +88,8 @@ def find_problems(
     except DataError as error:
         yield Problem(str(error), fatal=True)
         return
-    outside, motion = _Outside(metadata), _Motion(metadata, train=path.stem in SPELLINGS["train"])
+    train = path.stem in SPELLINGS["train"]
+    outside, motion = _Outside(metadata), _Motion(metadata, train=train)
     for index, frames in enumerate(trajectories.lengths.tolist()):
         values = int(trajectories.particle_counts[index]) * trajectories.dim
         step = max(_BLOCK_VALUES // values, _BLOCK_FRAMES)
@@ -111,6 +112,12 @@ def find_problems(
     suspicions = [*([str(outside)] if outside.count else []), *motion.suspicions()]
     for suspicion in suspicions:
         yield Problem(f"{path}: {suspicion}", fatal=False)
+    if train and (force := path.with_name("force.py")).exists():
+        yield Problem(
+            f"{force}: LagrangeBench takes the force on a particle from here; it is not read, and "
+            "one that depends on the place can be learned at the bounds alone",
+            fatal=False,
+        )
 
 
 class _Motion:
