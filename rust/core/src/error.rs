@@ -1,7 +1,7 @@
 //! The one error type of the crate.
 
-/// Why a graph could not be built or a scene not be simulated. Every message names
-/// the argument, the value that came, and what is accepted.
+/// Why a graph could not be built, a scene not be simulated or a network not be run. Every
+/// message names the argument and what is accepted.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// An argument lies outside what is accepted.

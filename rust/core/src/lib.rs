@@ -1,5 +1,5 @@
-//! Interaction graphs for learned particle simulators, and the material point
-//! solver that makes their training data. No Python in here: the binding crate
+//! Interaction graphs for learned particle simulators, their network on the CPU, and the
+//! material point solver that makes their training data. No Python in here: the binding crate
 //! converts arguments and calls these functions.
 
 mod error;

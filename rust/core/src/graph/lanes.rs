@@ -10,7 +10,7 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 #[cfg(target_arch = "x86_64")]
-mod network;
+mod bitonic;
 
 /// Numbers to the longest block.
 pub(super) const LONGEST: usize = 16;

@@ -5,11 +5,6 @@
 //! moves them, [`trajectory`] records its frames. A new material is a variant of
 //! [`Material`], a new scene one of [`Scene`].
 
-#![expect(
-    clippy::needless_range_loop,
-    reason = "one index runs over several vectors and matrices of constant size"
-)]
-
 mod grid;
 mod linalg;
 mod material;

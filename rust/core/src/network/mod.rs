@@ -174,6 +174,10 @@ impl Network<'_> {
 
     /// The heads' outputs `[N, :]` each, and with `keep` what [`Self::backward`] needs. A layer's
     /// copies of its weights go with it.
+    ///
+    /// # Errors
+    ///
+    /// If the features do not fit the network, or the pass not into memory.
     pub fn forward(
         self,
         features: Features<'_>,
@@ -282,8 +286,12 @@ impl Network<'_> {
     }
 
     /// The gradients that follow from those of the heads' outputs, after a forward pass over the
-    /// same parameters and `features` that kept `tape`. With `alone`, the heads behind the first
-    /// learn without a word to the rest of the network.
+    /// same parameters and `features` that kept `tape`. With `alone`, the gradients of the heads
+    /// behind the first end at the nodes' latents.
+    ///
+    /// # Errors
+    ///
+    /// If the features or the tape do not fit the network, or the gradients the heads.
     pub fn backward(
         self,
         features: Features<'_>,

@@ -8,7 +8,7 @@ use std::arch::x86_64::{
     _mm256_set1_epi32, _mm256_setr_epi32, _mm256_shuffle_epi32, _mm256_storeu_si256,
 };
 
-use super::network::{Keys, write_network};
+use super::bitonic::{Keys, write_network};
 use super::{Lanes, ONES, SHORTER as BLOCK, Scalar, Work};
 use crate::graph::order::NONE;
 

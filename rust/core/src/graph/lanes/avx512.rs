@@ -9,7 +9,7 @@ use std::arch::x86_64::{
     _mm512_shuffle_i32x4, _mm512_storeu_si512,
 };
 
-use super::network::{Keys, write_network};
+use super::bitonic::{Keys, write_network};
 use super::{LONGEST as BLOCK, Lanes, Scalar, Work};
 use crate::graph::order::NONE;
 
