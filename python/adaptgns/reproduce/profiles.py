@@ -305,7 +305,7 @@ class Sweep:
     trajectories: int | None = None
 
 
-FEW_AND_FAR = Sweep(tau=(90.0, 95.0), factor=(1.5, 2.0), radius=(0.85, 0.9, 0.95, 1.0))
+FEW_AND_FAR = Sweep(tau=(90.0, 95.0), factor=(1.5, 2.0), radius=(0.85, 0.9, 0.95, 1.0, 0.8))
 SWEEPS: dict[RuledPolicy, Sweep] = {"adaptive": Sweep(), "divergence": FEW_AND_FAR}
 
 
