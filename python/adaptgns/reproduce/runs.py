@@ -324,7 +324,7 @@ class DataSet:
         missing: dict[str, tuple[Run, PolicyName]] = {}
         for run in runs:
             for policy in run.model.policies:
-                if (name := timed_name(run.model, policy)) not in content["times"]:
+                if (name := self.timed_name(run.model, policy)) not in content["times"]:
                     missing.setdefault(name, (run, policy))
         if not missing:
             return
@@ -376,6 +376,16 @@ class DataSet:
             },
         )
 
+    def timed_name(self, model: Model, policy: PolicyName) -> str:
+        """Names a step of ``model`` among the times; where a rule was chosen, with the rule."""
+        name = f"{model.timed_as or model.name}, {policy}"
+        if model.chosen is None:
+            return name
+        rule = self.rule(model.chosen)
+        return ", ".join(
+            [name, *(f"{part} {rule[part]:g}" for part in ("tau", "factor", "radius"))]
+        )
+
     @property
     def times(self) -> dict[str, Any]:
         """What :meth:`time_steps` measured: by model and policy, and on what."""
@@ -384,7 +394,7 @@ class DataSet:
     def step_time(self, model: Model, policy: PolicyName) -> dict[str, Any]:
         """Of :attr:`times`, those of one model under one policy, and whether they are from
         "elsewhere", another processor than that of the first."""
-        name, times = timed_name(model, policy), self.times["times"]
+        name, times = self.timed_name(model, policy), self.times["times"]
         if name not in times:
             raise StudyError(
                 f"{self.metrics / 'times.json'}: has no step of {name}; the command without "
@@ -678,11 +688,6 @@ def centroid_mse(split: Trajectories, marks: Iterable[int]) -> dict[str, list[fl
         str(mark): [float(each[mark]) if mark < len(each) else math.nan for each in errors]
         for mark in marks
     }
-
-
-def timed_name(model: Model, policy: PolicyName) -> str:
-    """Names a step of ``model`` among the times."""
-    return f"{model.timed_as or model.name}, {policy}"
 
 
 def matched_radius(data: DataSet, name: str, radius: float) -> float:

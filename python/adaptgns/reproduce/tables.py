@@ -162,6 +162,8 @@ COMPARISONS: tuple[Comparison, ...] = (
     ),
     ("sigma or the last acceleration, NLL", ("nll", "adaptive"), ("nll", "acceleration")),
     ("sigma or the divergence around, NLL", ("nll", "adaptive"), ("nll", "divergence")),
+    ("the divergence around or fixed, NLL", ("nll", "divergence"), ("nll", "fixed")),
+    ("the last acceleration or fixed, NLL", ("nll", "acceleration"), ("nll", "fixed")),
     ("the last acceleration or fixed, MSE", ("mse", "acceleration"), ("mse", "fixed")),
     ("the divergence around or fixed, MSE", ("mse", "divergence"), ("mse", "fixed")),
     ("two-sided or fixed, same model", ("nll", "two-sided"), ("nll", "fixed")),
