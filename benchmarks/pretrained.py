@@ -2,9 +2,8 @@
 
     python benchmarks/pretrained.py results/laptop
 
-Of each data set's NLL models that were trained four times as long, the one with the lowest
-validation error, with nothing in it of where it was made. Their metrics are those of the study:
-``metrics/DATA/nll-400-SEED-*.json``.
+Of each data set the first seed's NLL model that was trained four times as long, with nothing in it
+of where it was made. Its metrics are those of the study: ``metrics/DATA/nll-400-0-*.json``.
 """
 
 from __future__ import annotations
@@ -13,20 +12,18 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from adaptgns.checkpoint import PRETRAINED, Checkpoint, read_checkpoint, write_checkpoint
+from adaptgns.checkpoint import PRETRAINED, read_checkpoint, write_checkpoint
 from adaptgns.data.default import EMBEDDED
 from adaptgns.reproduce.profiles import LONG_NLL
 
 
 def main() -> None:
     for name in EMBEDDED:
-        folders = sorted((Path(sys.argv[1]) / "training" / name).glob(f"{LONG_NLL.name}-[0-9]"))
-        made: dict[Path, Checkpoint] = {folder: read_checkpoint(folder) for folder in folders}
-        best = min(made, key=lambda folder: made[folder].best_score)
-        config = replace(made[best].config, data=name, out=None, resume=None, threads=None)
+        made = read_checkpoint(Path(sys.argv[1]) / "training" / name / f"{LONG_NLL}-0")
+        config = replace(made.config, data=name, out=None, resume=None, threads=None)
         path = PRETRAINED / f"{name}.safetensors"
-        write_checkpoint(path, replace(made[best], config=config))
-        print(f"{path}: {best.name}, step {made[best].step}, {path.stat().st_size // 1024} KiB")
+        write_checkpoint(path, replace(made, config=config))
+        print(f"{path}: step {made.step}, {path.stat().st_size // 1024} KiB")
 
 
 if __name__ == "__main__":

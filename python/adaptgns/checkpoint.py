@@ -72,22 +72,31 @@ def build_simulator(config: TrainConfig, metadata: Metadata) -> Simulator:
     )
 
 
-def take_weights(simulator: Simulator, path: Path) -> list[str]:
+def take_weights(simulator: Simulator, path: Path) -> tuple[list[str], list[str]]:
     """Give ``simulator`` the weights of the checkpoint ``path``; the names of those that it lacks,
-    which stay as they were.
+    which stay as they were, and of those that have no place here. Such is a variance head.
 
-    CheckpointError where any are of other shapes.
+    CheckpointError where the models differ in more.
     """
-    own, given = simulator.state_dict(), read_checkpoint(path).group("model")
+    checkpoint = read_checkpoint(path)
+    there, here = vars(checkpoint.config.model), vars(simulator.config)
+    for name in here:
+        if name != "radius" and here[name] != there[name]:
+            raise CheckpointError(
+                f"checkpoint {path}: its model.{name} is {there[name]}; accepted is one of this "
+                f"model's, {here[name]}"
+            )
+    own, given = simulator.state_dict(), checkpoint.group("model")
     taken = {name: weights for name, weights in given.items() if name in own}
     for name, weights in taken.items():
-        if (there := list(weights.shape)) != (here := list(own[name].shape)):
+        if (shape := list(weights.shape)) != list(own[name].shape):
             raise CheckpointError(
-                f"checkpoint {path}: {name} has the shape {there}, in this model {here}; accepted "
-                "is one with the same --model options, dimensions and material properties"
+                f"checkpoint {path}: {name} has the shape {shape}, in this model "
+                f"{list(own[name].shape)}; accepted is one with as many dimensions and material "
+                "properties"
             )
     simulator.load_state_dict(own | taken)
-    return [name for name in own if name not in taken]
+    return [name for name in own if name not in given], [name for name in given if name not in own]
 
 
 def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

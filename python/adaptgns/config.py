@@ -348,6 +348,8 @@ def from_json(kind: type[T], values: dict[str, Any], *, source: str) -> T:
 
     ``source`` names where the values came from, for the message of :class:`ConfigError`.
     """
+    if not isinstance(values, dict):
+        raise ConfigError(f"configuration {source}: got {values!r}; an object is accepted")
     try:
         return _converter.structure(values, kind)
     except cattrs.BaseValidationError as error:

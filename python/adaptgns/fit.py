@@ -245,11 +245,13 @@ class Trainer:
     def _next(self, batches: Iterator[Batch | None]) -> Batch | None:
         try:
             return next(batches)
-        except DataError as error:  # of a worker: with the trace of its process
-            told = str(error).rstrip().splitlines()[-1]
+        except (DataError, MemoryError, OSError) as error:
+            kind, told = type(error), str(error)
         if self.processes.count == 1:  # else the others are not here to save with
             self.save()
-        raise DataError(told.removeprefix(f"{DataError.__module__}.DataError: "))
+        if told.startswith("Caught "):  # in a worker, whose trace torch adds
+            told = told.rstrip().splitlines()[-1].split("Error: ", 1)[-1]
+        raise kind(told)
 
     def train_step(self, batch: Batch | None) -> Tensor:
         """One optimizer step on ``batch``, this process's share of it, None where that is nothing;
@@ -401,7 +403,7 @@ class Trainer:
         first_settled = c.schedule == "cosine" and self.step >= SETTLED * c.steps > before
         score = scores["valid_rollout_mse"]
         # Of those that collapsed the last is as good as any.
-        if first_settled or score < self.best_score or math.isinf(self.best_score):
+        if first_settled or score < self.best_score or not math.isfinite(self.best_score):
             self.best_score = score
             write_checkpoint(self.folder / BEST, self.checkpoint(resumable=False))
 
@@ -409,11 +411,14 @@ class Trainer:
 @contextmanager
 def _workers_end_with(batches: object) -> Iterator[None]:
     """End the workers behind an iterator of batches with the block. Torch does so when the iterator
-    goes, which the trace of an exception may keep, and at exit they would be waited for."""
+    goes, which the trace of an exception may keep, and then by a SIGTERM that they ignore; at exit
+    they would be waited for."""
     try:
         yield
     finally:
         getattr(batches, "_shutdown_workers", lambda: None)()
+        for worker in getattr(batches, "_workers", ()):  # one that was busy may be there yet
+            worker.kill()
 
 
 class Log:

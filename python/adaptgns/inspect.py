@@ -90,11 +90,13 @@ def inspect(config: InspectConfig, console: Console) -> list[Problem]:
                 fatal=False,
             )
         )
-    for trajectories in splits.values():
+    for split, trajectories in splits.items():
+        # Those of the test split may have bounds of their own.
+        bounded = metadata.suited(folder, split)[0] if states_radius(folder) else metadata
         found = {problem.message for problem in problems}
         problems += [
             problem
-            for problem in find_problems(trajectories, metadata)
+            for problem in find_problems(trajectories, bounded)
             if problem.message not in found
         ]
     _print_problems(console, problems)

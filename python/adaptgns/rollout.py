@@ -70,8 +70,8 @@ def steps(
     Raises ValueError for a trajectory or a policy that does not go with the model.
     """
     _check(simulator, trajectory, policy, count)
-    if every > 1 and not teacher_forcing:
-        raise ValueError(f"every: got {every}; without teacher forcing 1 is accepted")
+    if every < 1 or (every > 1 and not teacher_forcing):
+        raise ValueError(f"every: got {every}; accepted is 1, with teacher forcing 1 or more")
     device = simulator.lower.device
     true = torch.from_numpy(trajectory.positions).to(device)  # [T, N, d]
     particle_type = torch.from_numpy(trajectory.particle_type).to(device)

@@ -134,10 +134,11 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
         storage=_storage(config),
         load_if_exists=True,
     )
-    study.sampler = _sampler(config, begun=len(study.trials))
     _refuse_other(study, config)
 
     def objective(trial: optuna.Trial) -> float:
+        # By the trial's number, which no other process has.
+        study.sampler = _sampler(config, config.seed + trial.number)
         found = measure(simulator, split, config, **_suggest(trial, config, space))
         for name, value in found.items():
             trial.set_user_attr(name, value)
@@ -226,8 +227,7 @@ def _storage(config: SweepConfig) -> JournalStorage | RDBStorage:
     return JournalStorage(JournalFileBackend(str(config.out / JOURNAL)))
 
 
-def _sampler(config: SweepConfig, *, begun: int) -> optuna.samplers.BaseSampler:
-    seed = config.seed + begun  # so that several processes draw different ones
+def _sampler(config: SweepConfig, seed: int) -> optuna.samplers.BaseSampler:
     match config.sampler:
         case "tpe":
             return optuna.samplers.TPESampler(seed=seed)
@@ -258,7 +258,8 @@ def _refuse_other(study: optuna.Study, config: SweepConfig) -> None:
     if begun is None:
         study.set_user_attr("config", asked)
         return
-    begun = {"policy": "adaptive"} | begun  # which older journals do not name
+    # Older journals name neither, but the checkpoint's path.
+    begun = {"policy": "adaptive", "weights": asked["weights"]} | begun
     different = sorted(name for name in asked if begun.get(name) != asked[name])
     if different:
         raise ValueError(

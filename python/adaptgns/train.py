@@ -117,6 +117,8 @@ def parse(arguments: list[str]) -> TrainConfig:
             f"--out: got {config.out} beside --resume {folder}; a run goes on in its own folder "
             "(copy that to keep it as it is)"
         )
+    if folder is not None and config.init != default.init:
+        raise ValueError(f"--init: got {config.init} beside --resume {folder}; a run begins once")
     return config
 
 
@@ -136,13 +138,12 @@ def _take(arguments: list[str], option: str) -> tuple[str | None, list[str]]:
     given = [i for i, a in enumerate(arguments) if a == option or a.startswith(option + "=")]
     if len(given) > 1:
         raise ValueError(f"{option}: got it {len(given)} times; accepted is once")
-    for index in given:
-        before, (argument, *after) = arguments[:index], arguments[index:]
-        if argument != option:
-            return argument.split("=", 1)[1], before + after
-        if after:
-            return after[0], before + after[1:]
-    return None, arguments
+    if not given:
+        return None, arguments
+    before, (argument, *after) = arguments[: given[0]], arguments[given[0] :]
+    if argument != option:
+        return argument.split("=", 1)[1], before + after
+    return (after[0], before + after[1:]) if after else (None, arguments)
 
 
 def train(config: TrainConfig, folder: Path, console: Console, group: Processes) -> Path:
@@ -170,7 +171,10 @@ def train(config: TrainConfig, folder: Path, console: Console, group: Processes)
         )
         types = None
         if group.first:  # before anything depends on them; the others need not look again
-            types, *_ = (check_split(s, metadata) for s in (train_split, valid_split, test_split))
+            test_metadata, _ = metadata.suited(data, "test")  # whose bounds may be its own
+            types = check_split(train_split, metadata)
+            check_split(valid_split, metadata)
+            check_split(test_split, test_metadata)
         trainer = Trainer(
             config,
             metadata,
@@ -182,9 +186,11 @@ def train(config: TrainConfig, folder: Path, console: Console, group: Processes)
             processes=group,
         )
     if checkpoint is None and config.init is not None:
-        kept = take_weights(trainer.simulator, config.init)
-        left = f"; {len(kept)} weights begin anew: {', '.join(kept)}" if kept else ""
-        console.print(f"begins with the weights of {config.init}{left}", highlight=False)
+        told = f"begins with the weights of {config.init}"
+        apart = zip(("anew", "left out"), take_weights(trainer.simulator, config.init), strict=True)
+        for how, names in apart:
+            told += f"; {how}: {', '.join(names)}" if names else ""
+        console.print(told, highlight=False)
     if group.first:
         replace_text(folder / CONFIG, json.dumps(to_json(config), indent=1))
     console.print(

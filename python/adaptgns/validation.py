@@ -91,7 +91,7 @@ def validate(simulator: Simulator, valid: Trajectories, config: TrainConfig) -> 
         curve[: len(predicted)] = position_mse(
             np.stack(predicted), true[: len(predicted)], mobile, box
         )
-        curves.append(curve)
+        curves.append(np.where(np.isfinite(curve), curve, np.inf))
         shown = shown or (true, np.stack(predicted), np.stack(sigmas) if sigmas else None, mobile)
     assert shown is not None, "a split has a trajectory"
     shortest = min(map(len, curves))

@@ -277,14 +277,9 @@ def training_batches(
     )
 
 
-TO_SAVE = 60
-"""Seconds that a worker outlives SIGTERM"""
-
-
 def _begin_worker(_: int) -> None:
     """A worker is one thread, and leaves signals that reach the whole group of processes, Ctrl-C
-    and a scheduler's SIGTERM, to its parent, who saves and ends its workers; should it not, a
-    worker ends by itself."""
+    and a scheduler's SIGTERM, to its parent, who saves and ends its workers."""
     divide_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: signal.alarm(TO_SAVE))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)

@@ -292,17 +292,23 @@ def test_a_run_may_begin_with_the_weights_of_another(
     capsys.readouterr()
     main([*options, *few, "--init", str(first), "--out", str(second)])
     told = " ".join(capsys.readouterr().out.split())
-    assert f"begins with the weights of {first}; " in told
-    assert "weights begin anew: network.variance_head." in told
+    assert f"begins with the weights of {first}; anew: network.variance_head." in told
     before, after = (read_checkpoint(folder / LAST).group("model") for folder in (first, second))
     for name, weights in before.items():
         torch.testing.assert_close(after[name], weights, msg=name)
     assert set(after) > set(before)
     main(["--resume", str(second), "--steps", "2"])  # which does not begin again
     assert read_checkpoint(second / LAST).step == 2
-    with pytest.raises(SystemExit):
-        main([*options, "--init", "waterdrop", "--model.latent", "8", "--out", str(tmp_path / "x")])
-    assert "has the shape [64], in this model [8]" in " ".join(capsys.readouterr().err.split())
+    third = ["--loss", "mse", *few, "--init", str(second), "--out", str(tmp_path / "third")]
+    main([*options, *third])
+    assert "; left out: network.variance_head." in " ".join(capsys.readouterr().out.split())
+    for wrong, message in (
+        ([*options, "--init", "waterdrop", "--out", str(tmp_path / "x")], "its model.latent is 64"),
+        (["--resume", str(second), "--init", "waterdrop"], "a run begins once"),
+    ):
+        with pytest.raises(SystemExit):
+            main(wrong)
+        assert message in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("option", ["--preset", "--config", "--resume"])

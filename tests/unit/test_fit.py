@@ -274,19 +274,35 @@ def test_only_what_collapsed_is_stopped(
         assert np.isinf(score["valid_rollout_mse"]) == collapsed
 
 
-def test_where_all_collapsed_the_last_is_kept(
+def test_of_those_that_collapsed_the_last_is_kept_until_one_does_not(
     drops: Path, tmp_path: Path, small_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = trainer(drops, tmp_path, replace(small_config, schedule="exponential"))
     true = validation.validate
+    scores = iter((np.inf, np.inf, 1.0, 2.0))
 
-    def collapsed(*arguments: Any) -> validation.Validation:
+    def given(*arguments: Any) -> validation.Validation:
         made = true(*arguments)
-        return replace(made, scores=made.scores | {"valid_rollout_mse": np.inf})
+        return replace(made, scores=made.scores | {"valid_rollout_mse": next(scores)})
 
-    monkeypatch.setattr(fit, "validate", collapsed)
-    run.run(QUIET)
-    assert read_checkpoint(tmp_path / BEST).step == small_config.steps
+    monkeypatch.setattr(fit, "validate", given)
+    kept = []
+    with fit.Log(tmp_path, 0) as log:
+        for run.step in (10, 20, 30, 40):
+            run._validate(log)
+            kept.append(read_checkpoint(tmp_path / BEST).step)
+    assert kept == [10, 20, 30, 30]
+
+
+def test_what_is_lost_counts_as_infinitely_far(
+    drops: Path, tmp_path: Path, small_config: TrainConfig
+) -> None:
+    run = trainer(drops, tmp_path, small_config)
+    with torch.no_grad():
+        run.simulator.acceleration_std.fill_(torch.inf)
+    assert run.valid is not None
+    score = validation.validate(run.simulator, run.valid, run.config).scores["valid_rollout_mse"]
+    assert score == np.inf
 
 
 class Two(Processes):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from adaptgns.data import DataError, open_split, read_metadata
+from adaptgns.data.metadata import write_metadata
 from adaptgns.data.radius import advise_radius
 from adaptgns.graph_statistics import graph_statistics
 from adaptgns.inspect import main
@@ -196,3 +197,18 @@ def test_missing_split(drops: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "no test.h5 or test.npz; the folder holds metadata.json, train" in (
         capsys.readouterr().err
     )
+
+
+def test_the_test_split_may_have_bounds_of_its_own(
+    drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = json.loads((drops / "metadata.json").read_text())
+    other = tmp_path / "other"
+    shutil.copytree(drops, other)
+    with h5py.File(other / "test.h5", "r+") as file:
+        for trajectory in file.values():
+            trajectory["position"][..., 0] += 1.0
+    wider = content | {"bounds": [[0.1, 1.9], [0.1, 0.9]]}
+    for metadata, told in ((content, True), ({"train": content, "rollout": wider}, False)):
+        write_metadata(other, metadata)
+        assert ("test.h5: " in report(capsys, str(other))) == told

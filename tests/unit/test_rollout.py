@@ -150,7 +150,7 @@ def test_single_steps_now_and_then_are_those_of_all(
         assert one.edges == other.edges
         np.testing.assert_array_equal(one.positions, other.positions)
         np.testing.assert_array_equal(one.squared_error, other.squared_error)
-    with pytest.raises(ValueError, match="every: got 2; without teacher forcing 1 is accepted"):
+    with pytest.raises(ValueError, match="every: got 2; accepted is 1, with teacher"):
         next(steps(simulator, trajectory, Fixed(), 8, every=2))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -78,14 +79,16 @@ def test_what_was_tried_is_not_tried_again(
         sweep(replace(config, checkpoint=moved), QUIET)
 
 
-def test_journals_that_name_no_policy_are_of_the_adaptive_one(
+def test_older_journals_are_of_the_adaptive_policy(
     config: SweepConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     every = sweep(config, QUIET)["trials"]
     journal = config.out / JOURNAL
     text = journal.read_text()
-    assert '"policy":"adaptive",' in text
-    journal.write_text(text.replace('"policy":"adaptive",', ""))
+    older, count = re.subn(r'"policy":"adaptive",', '"checkpoint":"run",', text)
+    older, also = re.subn(r',"weights":"\w+"', "", older)
+    assert (count, also) == (1, 1)
+    journal.write_text(older)
     monkeypatch.setattr("adaptgns.sweep.measure", None)  # nothing is left to measure
     assert sweep(config, QUIET)["trials"] == every
     with pytest.raises(ValueError, match="holds trials with other policy"):
@@ -109,6 +112,16 @@ def test_any_rule_can_be_searched(config: SweepConfig, run: Path, policy: RuledP
     scalars = evaluate([rollout.out], (config.steps,)).to_json()["rollouts"][0]["scalars"]
     for name, scalar in (("mse", f"mse@{config.steps}"), ("edges", "edges_per_step")):
         assert row[name] == pytest.approx(scalars[scalar]["mean"], rel=1e-5)
+
+
+def test_processes_that_begin_together_draw_different_rules(config: SweepConfig) -> None:
+    """Two that take turns: each begins where the other has done one trial."""
+    drawn = replace(config, sampler="random", factor=(1.1, 1.5))
+    for trials in (1, 2, 3):
+        rows = sweep(replace(drawn, trials=trials), QUIET)["trials"]
+    assert len({row["factor"] for row in rows}) == 3
+    whole = sweep(replace(drawn, out=config.out.with_name("whole"), trials=3), QUIET)["trials"]
+    assert {row["factor"] for row in whole} == {row["factor"] for row in rows}
 
 
 def test_random_rules_are_of_a_seed(config: SweepConfig) -> None:

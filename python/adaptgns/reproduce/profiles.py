@@ -59,7 +59,7 @@ class Model:
     """Of the profile's training steps"""
     seeds: int | None = None
     """How many of the profile's seeds, from the first; None: all"""
-    seeds_on: Mapping[str, int] = field(default_factory=dict)
+    seeds_on: Mapping[str, int] = field(default_factory=dict, hash=False)
     """The same on embedded data sets where it has been trained with more"""
     sets: tuple[str, ...] | None = None
     """The embedded data sets that it is trained on; None: all, and any"""
@@ -186,6 +186,8 @@ def on_water(models: Iterable[Model]) -> tuple[Model, ...]:
     return tuple(replace(model, sets=("waterdrop",)) for model in models)
 
 
+LONG_NLL = f"{NLL.name}-400"
+"""Name of the model whose first seed comes with the package"""
 LONG = tuple(
     replace(model, seeds_on={"waterdrop": 2}) for model in longer(400, TUNED, TUNED_DIVERGENCE)
 )
@@ -397,7 +399,7 @@ PROFILES: dict[ProfileName, Profile] = {
         },
         long={
             "waterdrop": Long(
-                "nll-400",
+                LONG_NLL,
                 marks=(10, 20, 40 - HISTORY),
                 plan=SplitPlan("waterdrop", 2, frames=40, particles=(30, 50)),
             )
@@ -431,7 +433,7 @@ PROFILES: dict[ProfileName, Profile] = {
         long={
             "waterdrop": replace(
                 WATER_TO_THE_END,
-                model="nll-400",
+                model=LONG_NLL,
                 plan=SplitPlan("waterdrop", 10, frames=1000),
             )
         },

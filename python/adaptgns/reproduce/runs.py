@@ -275,6 +275,8 @@ class DataSet:
         """What the sweep chose. StudyError where it is missing or was another one."""
         path = self.metrics / chosen.folder / RESULT
         content = read_json(path)
+        profile = self.study.profile
+        Run(self, profile.model(chosen.budget), profile.seeds[0]).read("fixed", "valid")  # is there
         config = self._sweep_config(chosen)
         asked = json.loads(json.dumps(to_json(config)))
         for name, value in content["settings"].items():

@@ -130,6 +130,11 @@ COMPARISONS: tuple[Comparison, ...] = (
     ("lag and feedback: adaptive or two-pass", ("nll", "adaptive"), ("nll", "two-pass")),
     ("adaptive NLL or fixed MSE: the aim", ("nll", "adaptive"), ("mse", "fixed")),
     ("the chosen rule or fixed MSE: the aim", ("tuned", "adaptive"), ("mse", "fixed")),
+    (
+        "the divergence's chosen rule or fixed MSE: the aim",
+        ("tuned-divergence", "divergence"),
+        ("mse", "fixed"),
+    ),
     ("the chosen rule or fixed, same model", ("tuned", "adaptive"), ("nll", "fixed")),
     ("the chosen rule, uncertain or random", ("tuned", "adaptive"), ("tuned", "random")),
     ("NLL or MSE, fixed graphs", ("nll", "fixed"), ("mse", "fixed")),

@@ -13,7 +13,13 @@ pub(crate) fn available_memory() -> usize {
     let kind = ProcessRefreshKind::nothing().without_tasks();
     system.refresh_processes_specifics(ProcessesToUpdate::Some(&[own]), false, kind);
     let group = system.process(own).and_then(|own| own.cgroup_limits());
-    let group = group.map_or(u64::MAX, |limits| limits.free_memory);
+    // The kernel takes back what caches files before a limit is hit; "free" leaves that out.
+    let group = group.map_or(u64::MAX, |limits| {
+        limits
+            .total_memory
+            .saturating_sub(limits.rss)
+            .max(limits.free_memory)
+    });
     usize::try_from(system.available_memory().min(group)).unwrap_or(usize::MAX)
 }
 
