@@ -80,20 +80,18 @@ def take_weights(simulator: Simulator, path: Path) -> tuple[list[str], list[str]
     """
     checkpoint = read_checkpoint(path)
     there, here = vars(checkpoint.config.model), vars(simulator.config)
-    for name in here:
-        if name != "radius" and here[name] != there[name]:
-            raise CheckpointError(
-                f"checkpoint {path}: its model.{name} is {there[name]}; accepted is one of this "
-                f"model's, {here[name]}"
-            )
+    apart = {n: there[n] for n in here if n not in ("radius", "walls") and here[n] != there[n]}
+    if apart:
+        told = ", ".join(f"model.{n} is {value}, here {here[n]}" for n, value in apart.items())
+        raise CheckpointError(f"checkpoint {path}: {told}; accepted is one of the same network")
     own, given = simulator.state_dict(), checkpoint.group("model")
     taken = {name: weights for name, weights in given.items() if name in own}
     for name, weights in taken.items():
         if (shape := list(weights.shape)) != list(own[name].shape):
             raise CheckpointError(
                 f"checkpoint {path}: {name} has the shape {shape}, in this model "
-                f"{list(own[name].shape)}; accepted is one with as many dimensions and material "
-                "properties"
+                f"{list(own[name].shape)}; accepted is one with as many dimensions, open axes and "
+                "material properties"
             )
     simulator.load_state_dict(own | taken)
     return [name for name in own if name not in given], [name for name in given if name not in own]

@@ -76,7 +76,7 @@ def inspect(config: InspectConfig, console: Console) -> list[Problem]:
             console,
             config=config,
             radius=radius,
-            metadata=metadata,
+            metadata=_bounded(metadata, folder, config.split),
             split=splits[config.split],
             problems=problems,
         )
@@ -91,8 +91,7 @@ def inspect(config: InspectConfig, console: Console) -> list[Problem]:
             )
         )
     for split, trajectories in splits.items():
-        # Those of the test split may have bounds of their own.
-        bounded = metadata.suited(folder, split)[0] if states_radius(folder) else metadata
+        bounded = _bounded(metadata, folder, split)
         found = {problem.message for problem in problems}
         problems += [
             problem
@@ -110,6 +109,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         problems = inspect(config, Console(highlight=False))
     if any(problem.fatal for problem in problems):
         raise SystemExit(1)
+
+
+def _bounded(metadata: Metadata, folder: Path, split: str) -> Metadata:
+    """With the bounds of that split: those of the test split may be its own."""
+    return metadata.suited(folder, split)[0]
 
 
 def _read_metadata(

@@ -32,6 +32,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
 from rich.console import Console
 from rich.table import Table
+from sqlalchemy.exc import SQLAlchemyError
 
 from adaptgns.atomic import write_json
 from adaptgns.checkpoint import checkpoint_file, read_checkpoint
@@ -124,6 +125,12 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
     simulator, split = open_data(checkpoint, config.data, config.split, console)
     simulator = simulator.to(torch_device(config.device))
     tell_short(split, config.trajectories, config.steps, console)
+    policy = make_policy(config.policy, AdaptiveConfig(), k=0, seed=0)
+    if policy.needs_sigma and simulator.network.variance_head is None:
+        raise ValueError(
+            f"policy: got {config.policy}, which needs the model's variance; this model has none, "
+            "for which acceleration and divergence are accepted"
+        )
     config = replace(config, radius=config.radius or (simulator.radius,))
     space = {"tau": config.tau, "factor": config.factor, "radius": config.radius}
     config.out.mkdir(parents=True, exist_ok=True)
@@ -134,7 +141,7 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
         storage=_storage(config),
         load_if_exists=True,
     )
-    _refuse_other(study, config)
+    _refuse_other(study, config, split.path.parent)
 
     def objective(trial: optuna.Trial) -> float:
         # By the trial's number, which no other process has.
@@ -149,7 +156,7 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
 
     def tell(study: optuna.Study, trial: FrozenTrial) -> None:
         console.print(
-            f"{len(_complete(study))} of {wanted}: {_described(trial.params)}: MSE@{config.steps} "
+            f"{_ended(study, config)} of {wanted}: {_described(trial.params)}: MSE@{config.steps} "
             f"{trial.user_attrs['mse']:.2e}, {trial.user_attrs['edges']:,.0f} edges a step",
             highlight=False,
         )
@@ -157,7 +164,7 @@ def sweep(config: SweepConfig, console: Console) -> dict[str, Any]:
     wanted = config.trials or DRAWN
     if config.sampler == "grid":
         wanted = min(math.prod(map(len, space.values())), config.trials or sys.maxsize)
-    while len(_complete(study)) < wanted:
+    while _ended(study, config) < wanted:
         if config.sampler == "grid":
             study.enqueue_trial(_next_combination(study, space))
         study.optimize(objective, n_trials=1, callbacks=[tell])
@@ -209,6 +216,13 @@ def _complete(study: optuna.Study) -> dict[Combination, FrozenTrial]:
     return {tuple(sorted(trial.params.items())): trial for trial in ended}
 
 
+def _ended(study: optuna.Study, config: SweepConfig) -> int:
+    """How many trials count: of a grid each combination once."""
+    if config.sampler == "grid":
+        return len(_complete(study))
+    return len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+
+
 def _next_combination(study: optuna.Study, space: dict[str, tuple[float, ...]]) -> dict[str, float]:
     """One that has not been tried; rather one that nobody seems to be at, but an interrupted trial
     may look so for ever."""
@@ -223,7 +237,10 @@ def _next_combination(study: optuna.Study, space: dict[str, tuple[float, ...]]) 
 
 def _storage(config: SweepConfig) -> JournalStorage | RDBStorage:
     if config.storage is not None:
-        return RDBStorage(config.storage)
+        try:
+            return RDBStorage(config.storage)
+        except (ImportError, SQLAlchemyError) as error:
+            raise ValueError(f"storage: {config.storage}: {error}") from error
     return JournalStorage(JournalFileBackend(str(config.out / JOURNAL)))
 
 
@@ -245,11 +262,11 @@ def _suggest(
     }
 
 
-def _refuse_other(study: optuna.Study, config: SweepConfig) -> None:
+def _refuse_other(study: optuna.Study, config: SweepConfig, folder: Path) -> None:
     """Trials of one journal must be comparable."""
     weights = hashlib.sha256(checkpoint_file(config.checkpoint).read_bytes()).hexdigest()
-    asked = to_json(config) | {"weights": weights[:16]}
-    local = ["checkpoint", "out", "trials", "storage", "device", "edges"]
+    asked = to_json(config) | {"weights": weights[:16], "folder": str(folder.resolve())}
+    local = ["checkpoint", "data", "out", "trials", "storage", "device", "edges"]
     if config.policy != "random":
         local.append("seed")
     asked = {name: value for name, value in asked.items() if name not in local}
@@ -258,12 +275,13 @@ def _refuse_other(study: optuna.Study, config: SweepConfig) -> None:
     if begun is None:
         study.set_user_attr("config", asked)
         return
-    # Older journals name neither, but the checkpoint's path.
-    begun = {"policy": "adaptive", "weights": asked["weights"]} | begun
+    # Older journals name none of these, but the checkpoint's path, and the data as they were given.
+    begun = {"policy": "adaptive", **{name: asked[name] for name in ("weights", "folder")}} | begun
     different = sorted(name for name in asked if begun.get(name) != asked[name])
     if different:
         raise ValueError(
-            f"out: {config.out} holds trials with other {', '.join(different)}; name another folder"
+            f"out: {config.storage or config.out} holds trials with other {', '.join(different)}; "
+            "name another folder"
         )
 
 

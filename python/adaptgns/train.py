@@ -160,6 +160,8 @@ def train(config: TrainConfig, folder: Path, console: Console, group: Processes)
         own = data == Path(config.data)
         if own:  # which the checkpoints name, wherever they are used from
             config = replace(config, data=str(data.resolve()))
+        if config.init is not None and config.init.exists():  # else the name of a packaged one
+            config = replace(config, init=config.init.resolve())
         metadata = read_metadata(data)
         if checkpoint is not None and metadata != checkpoint.metadata:
             raise ValueError(

@@ -303,7 +303,10 @@ def test_a_run_may_begin_with_the_weights_of_another(
     main([*options, *third])
     assert "; left out: network.variance_head." in " ".join(capsys.readouterr().out.split())
     for wrong, message in (
-        ([*options, "--init", "waterdrop", "--out", str(tmp_path / "x")], "its model.latent is 64"),
+        (
+            [*options, "--init", "waterdrop", "--out", str(tmp_path / "x")],
+            "model.latent is 64, here 16",
+        ),
         (["--resume", str(second), "--init", "waterdrop"], "a run begins once"),
     ):
         with pytest.raises(SystemExit):

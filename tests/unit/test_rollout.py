@@ -350,6 +350,18 @@ def test_data_must_suit_the_model(drops: Path, tmp_path: Path) -> None:
     assert "there is no metadata.json" in note
 
 
+def test_what_is_wrong_with_other_bounds_is_told_with_its_file(drops: Path, tmp_path: Path) -> None:
+    metadata = read_metadata(drops)
+    content = json.loads((drops / "metadata.json").read_text())
+    del content["default_connectivity_radius"]  # which a rollout does not need
+    write_metadata(tmp_path, content)
+    assert metadata.suited(tmp_path, "test") == (metadata, [])
+    write_metadata(tmp_path, content | {"rollout": {"bounds": [[0, 1]]}})
+    assert metadata.suited(tmp_path, "valid") == (metadata, [])
+    with pytest.raises(DataError, match=r"metadata\.json, for test: bounds has 1 axes; dim is 2"):
+        metadata.suited(tmp_path, "test")
+
+
 @pytest.mark.parametrize("apart", [False, True])
 def test_walls_are_those_of_the_data(
     drops: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], apart: bool

@@ -124,6 +124,17 @@ def test_processes_that_begin_together_draw_different_rules(config: SweepConfig)
     assert {row["factor"] for row in whole} == {row["factor"] for row in rows}
 
 
+def test_equal_draws_count(config: SweepConfig) -> None:
+    drawn = replace(config, sampler="random", tau=(70.0,), radius=(0.015,), trials=2)
+    assert len(sweep(drawn, QUIET)["trials"]) == 1
+
+
+@pytest.mark.parametrize("storage", ["foo", "nonsense://x", "sqlite:////nonexistent/x.db"])
+def test_a_storage_that_cannot_be_is_told(config: SweepConfig, storage: str) -> None:
+    with pytest.raises(ValueError, match=f"storage: {storage}: "):
+        sweep(replace(config, storage=storage), QUIET)
+
+
 def test_random_rules_are_of_a_seed(config: SweepConfig) -> None:
     config = replace(config, policy="random", trials=1)
     sweep(config, QUIET)
@@ -140,7 +151,7 @@ def test_only_priors_do_without_a_variance(
     config = replace(config, checkpoint=out, tau=(70.0,), radius=(0.015,))
     with pytest.raises(ValueError, match="policy: got adaptive, which needs the model's variance"):
         sweep(config, QUIET)
-    config = replace(config, policy="divergence", out=tmp_path / "divergence")
+    config = replace(config, policy="divergence")  # in the same folder, where nothing was tried
     assert len(sweep(config, QUIET)["trials"]) == 1
 
 

@@ -84,7 +84,11 @@ class Metadata:
         if split == "test" and isinstance(content.get("rollout"), dict):
             section = section | content["rollout"]
         notes, bounds = [], self.bounds
-        for name, given in _setting(section, folder).items():
+        try:
+            settings = _setting({RADIUS_KEY: self.radius} | section, folder)
+        except DataError as error:
+            raise DataError(f"{folder / FILE_NAME}, for {split}: {error}") from error
+        for name, given in settings.items():
             trained = getattr(self, name)
             if given == trained:
                 continue
@@ -251,8 +255,9 @@ def _compute(
 
 def _write_back(path: Path, content: dict[str, Any], metadata: Metadata) -> None:
     """Adds the statistics that were missing to each section of the file."""
-    sections = [value for value in (content.get("train"), content.get("rollout")) if value]
-    for section in sections or [content]:
+    rollout = content.get("rollout")
+    apart = [rollout] if isinstance(rollout, dict) and "dim" in rollout else []  # a whole one
+    for section in (training_section(content), *apart):
         for ours, key in FILE_KEYS.items():
             section.setdefault(key, list(getattr(metadata, ours)))
     try:
