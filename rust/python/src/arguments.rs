@@ -6,7 +6,7 @@ use numpy::prelude::*;
 use numpy::{Element, PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArray};
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyBool, PyComplex};
+use pyo3::types::{PyBool, PyComplex, PyFloat};
 use std::num::NonZeroUsize;
 
 /// An array of real numbers, borrowed where it lies if its memory is in order.
@@ -76,6 +76,9 @@ pub fn numbers(argument: &str, value: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
 
 /// A real number, but no bool and no array; infinite where it is too large for a float64.
 pub fn number(argument: &str, value: &Bound<'_, PyAny>) -> PyResult<f64> {
+    if let Ok(number) = value.cast_exact::<PyFloat>() {
+        return Ok(number.value());
+    }
     let kind = value
         .getattr("dtype")
         .and_then(|dtype| dtype.getattr("kind"));

@@ -5,7 +5,7 @@ use std::mem::MaybeUninit;
 use super::Graph;
 use super::lanes::{LONGEST, Lanes, Work, widest};
 use super::memory::{Budget, Places, reserve, room};
-use super::order::{NONE, SHORT, write_sorted};
+use super::order::{NONE, SHORT, write_sorted_long};
 use crate::Error;
 use crate::threads::Team;
 
@@ -92,18 +92,18 @@ const PASSED_ALONE: usize = 1 << 14;
 /// Particles below which several threads wait for each other's memory longer than the rest takes.
 const WORTH_SHARING: usize = 1 << 10;
 
-/// How many of `count` particles, at most `most`, are dealt with as one task. Few tasks are a power
-/// of two, since threads that are as many then end together.
+/// How many of `count` particles are dealt with as one task: all where they are few, else at most
+/// `most`. Few tasks are a power of two, since threads that are as many then end together.
 pub(super) fn task_size(count: usize, most: usize) -> usize {
     const FEW_TASKS: usize = 16;
-    let mut tasks = count.div_ceil(most);
+    if count < WORTH_SHARING {
+        return count.max(1);
+    }
+    let mut tasks = count.div_ceil(most).max(2);
     if tasks < FEW_TASKS {
         tasks = tasks.next_power_of_two();
     }
-    if count >= WORTH_SHARING {
-        tasks = tasks.max(2);
-    }
-    count.div_ceil(tasks).max(1)
+    count.div_ceil(tasks)
 }
 
 /// Puts `parts`, each the rows of the receivers named, into one edge list over
@@ -198,36 +198,65 @@ impl Work for Writing<'_> {
 
     #[inline(always)]
     fn run<const BLOCK: usize, L: Lanes<BLOCK>>(self, lanes: L) {
+        let Self {
+            first,
+            first_edge,
+            rows,
+            offsets,
+            drop_self,
+            senders,
+            receivers,
+        } = self;
+        let edges = senders.len();
         let mut at = 0;
-        for (k, (row, offset)) in self.rows.iter().zip(self.offsets).enumerate() {
-            if let Some(soon) = self.rows.get(k + SOON) {
-                for place in (0..soon.len().min(SHORT + ROOM)).step_by(LINE) {
-                    lanes.prefetch(soon.as_ptr().wrapping_add(place));
-                }
+        for (k, (row, offset)) in rows.iter().zip(offsets).enumerate() {
+            let soon = rows[rows.len().min(k + SOON + 1) - 1];
+            for line in 0..2 {
+                lanes.prefetch(soon.as_ptr().wrapping_add(line * LINE));
             }
-            offset.write((self.first_edge + at) as i64);
-            let receiver = self.first + k as i32;
+            for place in (2 * LINE..soon.len().min(SHORT + ROOM)).step_by(LINE) {
+                lanes.prefetch(soon.as_ptr().wrapping_add(place));
+            }
+            offset.write((first_edge + at) as i64);
+            let receiver = first + k as i32;
             let found = row.len() - ROOM;
-            let count = found - usize::from(self.drop_self);
-            let dropped = if self.drop_self { receiver } else { NONE };
-            // SAFETY: a search finds every sender once, the receiver among them.
-            unsafe { write_sorted(lanes, row, found, dropped, &mut self.senders[at..]) };
-            fill(&mut self.receivers[at..], count, i64::from(receiver));
+            let count = found - usize::from(drop_self);
+            let dropped = if drop_self { receiver } else { NONE };
+            let places = at..at + count;
+            if found <= SHORT && at + found + LONGEST <= edges {
+                // SAFETY: a search finds every sender once, the receiver among them, and there is
+                // room for whole blocks, which the next rows overwrite.
+                unsafe {
+                    lanes.write_sorted(row, found, dropped, senders.as_mut_ptr().add(at).cast());
+                    fill(
+                        receivers.as_mut_ptr().add(at).cast(),
+                        count,
+                        i64::from(receiver),
+                    );
+                }
+            } else {
+                write_sorted_long(&row[..found], dropped, &mut senders[places.clone()]);
+                receivers[places].fill(MaybeUninit::new(i64::from(receiver)));
+            }
             at += count;
         }
     }
 }
 
-/// Writes `count` times `value` to the front of `out`: in whole blocks where there is
-/// room, since what they write too much the next row overwrites.
+/// Writes `count` times `value`, in whole blocks.
+///
+/// # Safety
+/// There is room for these, and for one at least.
 #[inline(always)]
-fn fill(out: &mut [MaybeUninit<i64>], count: usize, value: i64) {
-    const WHOLE: usize = 8;
-    for start in (0..count).step_by(WHOLE) {
-        let out = &mut out[start..];
-        match out.first_chunk_mut::<WHOLE>() {
-            Some(out) => *out = [MaybeUninit::new(value); WHOLE],
-            None => out[..count - start].fill(MaybeUninit::new(value)),
+unsafe fn fill(out: *mut [i64; LONGEST / 2], count: usize, value: i64) {
+    const WHOLE: usize = LONGEST / 2;
+    // SAFETY: promised by the caller.
+    unsafe {
+        out.write_unaligned([value; WHOLE]);
+        if count > WHOLE {
+            for block in 1..count.div_ceil(WHOLE) {
+                out.add(block).write_unaligned([value; WHOLE]);
+            }
         }
     }
 }
@@ -238,7 +267,7 @@ mod tests {
 
     #[test]
     fn tasks_are_one_then_a_power_of_two_then_as_large_as_they_may_be() {
-        let sizes = [0, 1, 1_023, 1_024, 1_025, 5_000, 16_000, 1_000_000];
+        let sizes = [0, 1, 1_023, 1_024, 2_049, 5_000, 16_000, 1_000_000];
         assert_eq!(
             sizes.map(|count| task_size(count, 1_024)),
             [1, 1, 1_023, 512, 513, 625, 1_000, 1_024]

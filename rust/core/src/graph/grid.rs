@@ -8,7 +8,7 @@
 
 use std::ops::Range;
 
-use super::lanes::LONGEST;
+use super::lanes::{LONGEST, Lanes, Work, widest};
 use super::memory::{SHARE, collected};
 use super::scalar::Scalar;
 use super::sort::sort_by_cell;
@@ -107,6 +107,16 @@ impl Axis {
         cell.min(self.count - 1)
     }
 
+    /// The same where there are no more cells than an `i32` counts, which several coordinates at
+    /// once are converted to.
+    #[inline(always)]
+    fn cell_of_few<T: Scalar>(&self, x: T) -> u32 {
+        let cell = (x.to_f64() - self.origin) * self.cells_per_length;
+        let cell = cell.greater(0.0).lesser((self.count - 1) as f64);
+        // SAFETY: it is in range, as the larger of NaN and 0 is 0.
+        (unsafe { cell.to_int_unchecked::<i32>() }) as u32
+    }
+
     /// The cells and those beside them, each once, as one run and on a periodic axis perhaps
     /// a second one.
     #[inline(always)]
@@ -124,6 +134,27 @@ impl Axis {
         } else {
             [before..behind, 0..0]
         }
+    }
+}
+
+/// The numbers of the cells that hold `positions`, in a dense grid.
+struct Numbers<'a, T, const D: usize> {
+    axes: [Axis; D],
+    positions: &'a [[T; D]],
+}
+
+impl<T: Scalar, const D: usize> Work for Numbers<'_, T, D> {
+    type Output = Vec<u32>;
+
+    #[inline(always)]
+    fn run<const BLOCK: usize, L: Lanes<BLOCK>>(self, _: L) -> Vec<u32> {
+        let Self { axes, positions } = self;
+        let number = |p: &[T; D]| {
+            (0..D).rev().fold(0, |row, a| {
+                row * axes[a].count as u32 + axes[a].cell_of_few(p[a])
+            })
+        };
+        positions.iter().map(number).collect()
     }
 }
 
@@ -169,7 +200,7 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
                 )
             })
             .unwrap_or(([0.0; D], [0.0; D]));
-        let most = (MOST_CELLS_PER_PARTICLE * positions.len() + 1024).min(u32::MAX as usize);
+        let most = (MOST_CELLS_PER_PARTICLE * positions.len() + 1024).min(i32::MAX as usize);
         let axes: [Axis; D] =
             std::array::from_fn(|a| Axis::new(low[a], high[a], period[a], cutoff));
         let cells = axes.iter().map(|axis| axis.count as f64).product::<f64>();
@@ -187,12 +218,13 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
         cells: usize,
         team: &Team,
     ) -> Self {
-        let cell = |p: &[T; D]| {
-            (0..D).rev().fold(0, |row, a| {
-                row * axes[a].count as u32 + axes[a].cell(p[a]) as u32
+        let numbers = |particles: Range<usize>| {
+            widest(Numbers {
+                axes,
+                positions: &positions[particles],
             })
         };
-        let sorted = sort_by_cell(positions, first, cells, cell, team);
+        let sorted = sort_by_cell(positions, first, cells, numbers, team);
         Self {
             together: together(&axes, positions.len()),
             axes,
@@ -259,8 +291,8 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
             .iter()
             .map(|axis| ((D as f64).sqrt() / (axis.cells_per_length * radius)).ceil())
             .product();
-        let square = |n: usize| (n * n) as f64;
-        let pairs: f64 = match &self.rows {
+        let square = |n: usize| n as u64 * n as u64;
+        let pairs: u64 = match &self.rows {
             Rows::Dense { starts } => starts
                 .windows(2)
                 .map(|cell| square((cell[1] - cell[0]) as usize))
@@ -271,7 +303,7 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
                 .map(|cell| square(cell.len()))
                 .sum(),
         };
-        ((pairs / boxes) as usize).saturating_sub(self.index().len())
+        ((pairs as f64 / boxes) as usize).saturating_sub(self.index().len())
     }
 
     /// Goes through the sorted particles `slots`, group of cells after group.
@@ -362,21 +394,41 @@ impl<T: Scalar, const D: usize> Cells<'_, T, D> {
             self.x = 0;
             self.grid.neighbour_rows(self.row, &mut self.neighbours);
         }
-        self.x = rows.x_of(self.row, start, self.x, axes);
-        self.run_count = 0;
-        let cells = self.x..(self.x + self.grid.together).min(axes[0].count);
-        for reached in axes[0].around(cells.clone()) {
+        let end = match rows {
+            Rows::Dense { starts } => {
+                let cells = axes[0].count as usize;
+                let cell_start = |row: usize, x: u64| starts[row * cells + x as usize] as usize;
+                self.x = (self.x..)
+                    .find(|&x| cell_start(self.row, x + 1) > start)
+                    .expect("a row ends after its particles");
+                self.reach(cell_start)
+            }
+            Rows::Sparse { x, .. } => {
+                self.x = x[start];
+                self.reach(|row, x| rows.cell_start(row, x, axes))
+            }
+        };
+        self.slots.start = end.min(self.slots.end);
+        Some(start..self.slots.start)
+    }
+
+    /// Holds the runs around the group of cells that begins at [`Self::x`] in this row, where a
+    /// row's particles from a cell on begin at `cell_start`; returns where the group ends.
+    #[inline(always)]
+    fn reach(&mut self, cell_start: impl Fn(usize, u64) -> usize) -> usize {
+        let x_axis = &self.grid.axes[0];
+        let cells = self.x..(self.x + self.grid.together).min(x_axis.count);
+        let mut count = 0;
+        for reached in x_axis.around(cells.clone()) {
             if !reached.is_empty() {
                 for &row in &self.neighbours {
-                    self.runs[self.run_count] = rows.cell_start(row, reached.start, axes)
-                        ..rows.cell_start(row, reached.end, axes);
-                    self.run_count += 1;
+                    self.runs[count] = cell_start(row, reached.start)..cell_start(row, reached.end);
+                    count += 1;
                 }
             }
         }
-        let end = rows.cell_start(self.row, cells.end, axes);
-        self.slots.start = end.min(self.slots.end);
-        Some(start..self.slots.start)
+        self.run_count = count;
+        cell_start(self.row, cells.end)
     }
 }
 
@@ -387,17 +439,6 @@ impl<const D: usize> Rows<D> {
         match self {
             Rows::Dense { starts } => starting(starts) / axes[0].count as usize,
             Rows::Sparse { starts, .. } => starting(starts),
-        }
-    }
-
-    /// The cell along x of a particle in `row`, which is not before `from`.
-    #[inline(always)]
-    fn x_of(&self, row: usize, slot: usize, from: u64, axes: &[Axis; D]) -> u64 {
-        match self {
-            Rows::Dense { .. } => (from..)
-                .find(|&x| self.cell_start(row, x + 1, axes) > slot)
-                .expect("a row ends after its particles"),
-            Rows::Sparse { x, .. } => x[slot],
         }
     }
 

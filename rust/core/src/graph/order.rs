@@ -2,36 +2,15 @@
 
 use std::mem::MaybeUninit;
 
-use super::lanes::{LONGEST, Lanes};
-
 /// Longest row that is sorted in vector instructions.
 pub(super) const SHORT: usize = 64;
 
 /// Stands for no sender: larger than any.
 pub(super) const NONE: i32 = i32::MAX;
 
-/// Writes the first `n` of `row` in ascending order to the front of `out`, without `dropped`,
-/// which is one of them or [`NONE`]. In `out` what lies behind them may be overwritten.
-///
-/// # Safety
-/// The senders are distinct, and `row` goes on for a block behind them.
-#[inline(always)]
-pub(super) unsafe fn write_sorted<const BLOCK: usize, L: Lanes<BLOCK>>(
-    lanes: L,
-    row: &[i32],
-    n: usize,
-    dropped: i32,
-    out: &mut [MaybeUninit<i64>],
-) {
-    if n > SHORT || out.len() < n.next_multiple_of(LONGEST) {
-        return write_sorted_long(&row[..n], dropped, out);
-    }
-    // SAFETY: promised by the caller, and there is room.
-    unsafe { lanes.write_sorted(row, n, dropped, out.as_mut_ptr().cast()) }
-}
-
+/// Writes `row` in ascending order to `out`, without `dropped`.
 #[cold]
-fn write_sorted_long(row: &[i32], dropped: i32, out: &mut [MaybeUninit<i64>]) {
+pub(super) fn write_sorted_long(row: &[i32], dropped: i32, out: &mut [MaybeUninit<i64>]) {
     let mut row = row.to_vec();
     row.sort_unstable();
     let kept = row.iter().filter(|&&sender| sender != dropped);

@@ -29,14 +29,10 @@ pub(super) enum Cutoff<T> {
 pub(super) struct Search<T, const D: usize> {
     grid: Grid<T, D>,
     period: [T; D],
-    limits: Limits<T>,
-}
-
-/// Squared cutoffs.
-enum Limits<T> {
-    Uniform(T),
-    /// In cell order, with room for a block at the end.
-    PerParticle(Vec<T>),
+    /// The largest squared cutoff.
+    limit: T,
+    /// Where each particle has its own, those in cell order, with room for a block at the end.
+    limits: Vec<T>,
 }
 
 impl<T: Scalar, const D: usize> Search<T, D> {
@@ -58,18 +54,19 @@ impl<T: Scalar, const D: usize> Search<T, D> {
         );
         budget.check(grid.pairs_at_least(shortest.to_f64()))?;
         let limits = match cutoff {
-            &Cutoff::Uniform(r) => Limits::Uniform(r * r),
+            Cutoff::Uniform(_) => Vec::new(),
             Cutoff::PerParticle { radii, .. } => {
                 let index = grid.index();
-                Limits::PerParticle(collected(team, index.len() + LONGEST, |slot| {
+                collected(team, index.len() + LONGEST, |slot| {
                     let r = index.get(slot).map_or(T::default(), |&i| radii[i as usize]);
                     r * r
-                }))
+                })
             }
         };
         Ok(Self {
             grid,
             period: batch.period,
+            limit: longest * longest,
             limits,
         })
     }
@@ -82,10 +79,10 @@ impl<T: Scalar, const D: usize> Search<T, D> {
     /// The rows of the sorted particles `slots`, every one among its own neighbours.
     pub fn run(&self, slots: Range<usize>, budget: &Budget) -> Result<Rows, Error> {
         let periodic = self.period.iter().any(|length| length.is_finite());
-        match (periodic, &self.limits) {
-            (false, Limits::Uniform(_)) => self.pass::<false, true>(slots, budget),
+        match (periodic, self.limits.is_empty()) {
+            (false, true) => self.pass::<false, true>(slots, budget),
             (false, _) => self.pass::<false, false>(slots, budget),
-            (true, Limits::Uniform(_)) => self.pass::<true, true>(slots, budget),
+            (true, true) => self.pass::<true, true>(slots, budget),
             (true, _) => self.pass::<true, false>(slots, budget),
         }
     }
@@ -178,7 +175,7 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
         search: &Search<T, D>,
         runs: &[Range<usize>],
     ) {
-        self.count = runs.iter().map(Range::len).sum();
+        self.count = runs.iter().map(|run| run.end - run.start).sum();
         let room = self.count + BLOCK;
         if self.index.len() < room {
             for coords in &mut self.coords {
@@ -189,7 +186,9 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
         }
         let mut end = 0;
         for run in runs {
-            for (from, to) in run.clone().step_by(BLOCK).zip((end..).step_by(BLOCK)) {
+            let mut copied = 0;
+            loop {
+                let (from, to) = (run.start + copied, end + copied);
                 // SAFETY: there is room for a block behind the sorted particles and behind
                 // the candidates.
                 unsafe {
@@ -197,12 +196,16 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
                         copy_block::<BLOCK, _>(sorted, from, coords, to);
                     }
                     copy_block::<BLOCK, _>(&search.grid.index, from, &mut self.index, to);
-                    if let (false, Limits::PerParticle(limits)) = (UNIFORM, &search.limits) {
-                        copy_block::<BLOCK, _>(limits, from, &mut self.limits, to);
+                    if !UNIFORM {
+                        copy_block::<BLOCK, _>(&search.limits, from, &mut self.limits, to);
                     }
                 }
+                copied += BLOCK;
+                if from + BLOCK >= run.end {
+                    break;
+                }
             }
-            end += run.len();
+            end += run.end - run.start;
         }
         let behind = self.coords[0][end..].first_chunk_mut::<BLOCK>();
         *behind.expect("room for a block") = [T::NAN; BLOCK];
@@ -219,9 +222,10 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
         mut found: impl FnMut(u16, &[i32; BLOCK]),
     ) {
         let here: [T; D] = std::array::from_fn(|a| search.grid.coords[a][receiver]);
-        let limit = match &search.limits {
-            &Limits::Uniform(limit) => limit,
-            Limits::PerParticle(limits) => limits[receiver],
+        let limit = if UNIFORM {
+            search.limit
+        } else {
+            search.limits[receiver]
         };
         for start in (0..self.count).step_by(BLOCK) {
             let mut distances = [T::default(); BLOCK];

@@ -4,6 +4,7 @@
 //! fits into the cache while its particles are sorted, and threads share both passes.
 
 use std::mem::MaybeUninit;
+use std::ops::Range;
 
 use super::lanes::LONGEST;
 use super::memory::{filled, room};
@@ -37,12 +38,13 @@ struct Particle<T, const D: usize> {
     cell: u32,
 }
 
-/// Sorts `positions`, whose caller's indices begin at `first`, by their `cell` of so many `cells`.
+/// Sorts `positions`, whose caller's indices begin at `first`, into so many `cells`; `numbers`
+/// tells that of each in a range.
 pub(super) fn sort_by_cell<T: Scalar, const D: usize>(
     positions: &[[T; D]],
     first: usize,
     cells: usize,
-    cell: impl Fn(&[T; D]) -> u32 + Sync,
+    numbers: impl Fn(Range<usize>) -> Vec<u32> + Sync,
     team: &Team,
 ) -> Sorted<T, D> {
     let count = positions.len();
@@ -59,18 +61,19 @@ pub(super) fn sort_by_cell<T: Scalar, const D: usize>(
             .map(|coords| &mut coords.spare_capacity_mut()[..count]),
         index: &mut index.spare_capacity_mut()[..count],
     };
-    let particle = |i: usize| Particle {
+    let particle = |i: usize, cell| Particle {
         position: positions[i],
         index: (first + i) as i32,
-        cell: cell(&positions[i]),
+        cell,
     };
     let slabs = (count / SLAB).min(MOST_SLABS);
     if slabs < 2 {
-        let particles: Vec<_> = (0..count).map(particle).collect();
+        let numbered = (0..count).zip(numbers(0..count));
+        let particles: Vec<_> = numbered.map(|(i, cell)| particle(i, cell)).collect();
         all.sort(&particles);
     } else {
         let bits = cells.div_ceil(slabs).next_power_of_two().ilog2();
-        let (particles, counts) = to_slabs(count, particle, cells, bits, team);
+        let (particles, counts) = to_slabs(count, particle, numbers, cells, bits, team);
         let mut left = &particles[..];
         let tasks = counts.iter().map(|&count| {
             let particles = left.split_off(..count).expect("counted");
@@ -97,7 +100,8 @@ pub(super) fn sort_by_cell<T: Scalar, const D: usize>(
 /// many there are in each.
 fn to_slabs<T: Scalar, const D: usize>(
     count: usize,
-    particle: impl Fn(usize) -> Particle<T, D> + Sync,
+    particle: impl Fn(usize, u32) -> Particle<T, D> + Sync,
+    numbers: impl Fn(Range<usize>) -> Vec<u32> + Sync,
     cells: usize,
     bits: u32,
     team: &Team,
@@ -109,14 +113,10 @@ fn to_slabs<T: Scalar, const D: usize>(
         .map(|begin| begin..count.min(begin + part));
     let counted = team.map(parts.collect(), |part| {
         let mut counts = vec![0; slabs];
-        let cells: Vec<u32> = part
-            .clone()
-            .map(|i| {
-                let Particle { cell, .. } = particle(i);
-                counts[(cell >> bits) as usize] += 1;
-                cell
-            })
-            .collect();
+        let cells = numbers(part.clone());
+        for cell in &cells {
+            counts[(cell >> bits) as usize] += 1;
+        }
         (part, cells, counts)
     });
     let mut particles = room(count);
@@ -135,10 +135,7 @@ fn to_slabs<T: Scalar, const D: usize>(
     team.map(tasks, |((part, cells, _), mut places)| {
         for (i, cell) in part.zip(cells) {
             let place = places[(cell >> bits) as usize].next();
-            place.expect("counted").write(Particle {
-                cell,
-                ..particle(i)
-            });
+            place.expect("counted").write(particle(i, cell));
         }
     });
     // SAFETY: the places of all parts are all of it, and each was written to.
@@ -227,8 +224,9 @@ mod tests {
     fn check(threads: Threads, count: usize, cells: usize, cell_of: impl Fn(usize) -> usize) {
         const FIRST: usize = 5;
         let positions: Vec<[f64; 2]> = (0..count).map(|i| [i as f64, cell_of(i) as f64]).collect();
+        let numbers = |range: Range<usize>| positions[range].iter().map(|p| p[1] as u32).collect();
         let sorted = team(threads, |team| {
-            sort_by_cell(&positions, FIRST, cells, |p| p[1] as u32, team)
+            sort_by_cell(&positions, FIRST, cells, numbers, team)
         });
         let mut expected = positions.clone();
         expected.sort_by(|p, q| p[1].total_cmp(&q[1]));

@@ -127,7 +127,7 @@ impl Keys for __m256i {
     }
 
     #[inline(always)]
-    unsafe fn sorted(self, _: bool) -> Self {
+    unsafe fn sorted(self) -> Self {
         // SAFETY: promised by the caller.
         unsafe {
             let keys = step::<1, 0b0110_0110>(self);

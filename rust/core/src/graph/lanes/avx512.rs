@@ -53,7 +53,12 @@ impl Lanes<BLOCK> for Avx512 {
         // SAFETY: promised by the caller.
         unsafe {
             match n.div_ceil(BLOCK) {
-                0 | 1 => write_network::<__m512i, 1>(row, n, dropped, out),
+                _ if n <= HALF => {
+                    let keys =
+                        _mm512_castsi512_si256(__m512i::load(row.as_ptr(), n, dropped)).sorted();
+                    _mm512_storeu_si512(out.cast(), _mm512_cvtepi32_epi64(keys));
+                }
+                1 => write_network::<__m512i, 1>(row, n, dropped, out),
                 2 => write_network::<__m512i, 2>(row, n, dropped, out),
                 _ => write_network::<__m512i, 4>(row, n, dropped, out),
             }
@@ -150,13 +155,12 @@ impl Keys for __m512i {
     }
 
     #[inline(always)]
-    unsafe fn sorted(self, half: bool) -> Self {
+    unsafe fn sorted(self) -> Self {
         // SAFETY: promised by the caller.
         unsafe {
             let keys = step::<2, 1>(self);
             let keys = step::<4, 1>(step::<4, 2>(keys));
-            let keys = step::<8, 1>(step::<8, 2>(step::<8, 4>(keys)));
-            if half { keys } else { keys.ascending() }
+            step::<8, 1>(step::<8, 2>(step::<8, 4>(keys))).ascending()
         }
     }
 

@@ -34,11 +34,11 @@ pub(super) trait Keys: Copy {
     /// The processor has such registers.
     unsafe fn reversed(self) -> Self;
 
-    /// In ascending order, at least the first half, where all behind that is [`NONE`] for `half`.
+    /// In ascending order.
     ///
     /// # Safety
     /// The processor has such registers.
-    unsafe fn sorted(self, half: bool) -> Self;
+    unsafe fn sorted(self) -> Self;
 
     /// What rises and then falls, or the other way round, in ascending order.
     ///
@@ -63,11 +63,12 @@ pub(super) unsafe fn write_network<V: Keys, const K: usize>(
     debug_assert!(n <= K * V::LANES && n <= row.len());
     // SAFETY: promised by the caller.
     unsafe {
-        let mut vectors: [V; K] = std::array::from_fn(|k| {
+        let mut vectors = [V::load(row.as_ptr(), n.min(V::LANES), dropped).sorted(); K];
+        for (k, keys) in vectors.iter_mut().enumerate().skip(1) {
             let left = n.saturating_sub(k * V::LANES).min(V::LANES);
             let first = if left == 0 { 0 } else { k * V::LANES };
-            V::load(row.as_ptr().add(first), left, dropped).sorted(K == 1 && 2 * n <= V::LANES)
-        });
+            *keys = V::load(row.as_ptr().add(first), left, dropped).sorted();
+        }
         let mut size = 1;
         while size < K {
             for pair in vectors.chunks_exact_mut(2 * size) {
