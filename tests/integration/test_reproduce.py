@@ -275,7 +275,7 @@ def test_laptop_goes_on_training_on_water_alone_and_every_comparison_is_of_model
     longest = {run.name for run in study.runs() if run.model.share == 8}
     assert longest == {f"waterdrop/{name}-800-0" for name in ("mse", "nll", "tuned")}
     long = {run.name for run in study.runs() if run.model.name == "nll-400"}
-    assert long == {"waterdrop/nll-400-0", "waterdrop/nll-400-1", "sand/nll-400-0"}
+    assert long == {f"{data}/nll-400-{seed}" for data in ("waterdrop", "sand") for seed in (0, 1)}
     models = [model for profile in PROFILES.values() for model in profile.models]
     known = {(model.name, policy) for model in models for policy in model.policies}
     for question, one, other in COMPARISONS:

@@ -59,8 +59,6 @@ class Model:
     """Of the profile's training steps"""
     seeds: int | None = None
     """How many of the profile's seeds, from the first; None: all"""
-    seeds_on: Mapping[str, int] = field(default_factory=dict, hash=False)
-    """The same on embedded data sets where it has been trained with more"""
     sets: tuple[str, ...] | None = None
     """The embedded data sets that it is trained on; None: all, and any"""
     timed_as: str | None = None
@@ -75,9 +73,7 @@ class Model:
     def length(self) -> str:
         """What sets its training apart from that of others of its kind; as a rule nothing."""
         share = "" if self.share == 1 else f"{100 * self.share:.0f} % of the steps"
-        return ", ".join(
-            filter(None, (share, "one seed" if self.seeds == 1 and not self.seeds_on else ""))
-        )
+        return ", ".join(filter(None, (share, "one seed" if self.seeds == 1 else "")))
 
     @property
     def title(self) -> str:
@@ -150,16 +146,16 @@ EARLY = tuple(
 )
 
 
-def longer(percent: int, *tuned: Model) -> tuple[Model, ...]:
+def longer(percent: int, *tuned: Model, seeds: int = 1) -> tuple[Model, ...]:
     """MSE, NLL and its chosen rules ``tuned``, trained for so many percent of the steps with the
-    first seed; the rules may have as many edges as the fixed graph of MSE."""
+    first ``seeds``; the rules may have as many edges as the fixed graph of MSE."""
 
     def of(model: Model, **settings: Any) -> Model:
         return replace(
             model,
             name=f"{model.name}-{percent}",
             share=percent / 100,
-            seeds=1,
+            seeds=seeds,
             whole_test=True,
             **settings,
         )
@@ -188,9 +184,7 @@ def on_water(models: Iterable[Model]) -> tuple[Model, ...]:
 
 LONG_NLL = f"{NLL.name}-400"
 """Name of the model whose first seed comes with the package"""
-LONG = tuple(
-    replace(model, seeds_on={"waterdrop": 2}) for model in longer(400, TUNED, TUNED_DIVERGENCE)
-)
+LONG = longer(400, TUNED, TUNED_DIVERGENCE, seeds=2)
 LONGEST = on_water(longer(800, TUNED))
 ADAPTIVE_NLL = replace(
     NLL,
@@ -351,9 +345,9 @@ class Profile:
     long: Mapping[str, Long] = field(default_factory=dict)
     """By data set: rollouts over far more frames than :attr:`horizon`"""
 
-    def seeds_of(self, model: Model, data: str) -> tuple[int, ...]:
-        """Those that ``model`` is trained with on the data set of that source."""
-        return self.seeds[: model.seeds_on.get(data, model.seeds)]
+    def seeds_of(self, model: Model) -> tuple[int, ...]:
+        """Those that ``model`` is trained with."""
+        return self.seeds[: model.seeds]
 
     def trajectories_of(self, model: Model, split: str) -> int | None:
         """How many of the split's trajectories ``model`` is rolled out over; None: all."""

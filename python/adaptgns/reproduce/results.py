@@ -156,7 +156,7 @@ class Results:
     def _series(
         self, data: DataSet, model: Model, policy: PolicyName, split: Split = "test"
     ) -> Series:
-        seeds = self.study.profile.seeds_of(model, data.source)
+        seeds = self.study.profile.seeds_of(model)
         runs = tuple(Run(data, model, seed) for seed in seeds)
         return Series(model, policy, runs, split)
 

@@ -127,7 +127,7 @@ class Study:
             for seed in self.profile.seeds:
                 for data in self.sets.values():
                     for model in self.profile.models_on(data.source):
-                        seeds = self.profile.seeds_of(model, data.source)
+                        seeds = self.profile.seeds_of(model)
                         if model.depends == depends and seed in seeds:
                             yield Run(data, model, seed)
 

@@ -211,6 +211,7 @@ impl Work for Writing<'_> {
         let mut at = 0;
         for (k, (row, offset)) in rows.iter().zip(offsets).enumerate() {
             let soon = rows[rows.len().min(k + SOON + 1) - 1];
+            // A row and its room always lie in two.
             for line in 0..2 {
                 lanes.prefetch(soon.as_ptr().wrapping_add(line * LINE));
             }
@@ -222,10 +223,9 @@ impl Work for Writing<'_> {
             let found = row.len() - ROOM;
             let count = found - usize::from(drop_self);
             let dropped = if drop_self { receiver } else { NONE };
-            let places = at..at + count;
             if found <= SHORT && at + found + LONGEST <= edges {
-                // SAFETY: a search finds every sender once, the receiver among them, and there is
-                // room for whole blocks, which the next rows overwrite.
+                // SAFETY: a search finds every sender once, the receiver among them, in front of
+                // `ROOM`; there is room for whole blocks, which the next rows overwrite.
                 unsafe {
                     lanes.write_sorted(row, found, dropped, senders.as_mut_ptr().add(at).cast());
                     fill(
@@ -235,6 +235,7 @@ impl Work for Writing<'_> {
                     );
                 }
             } else {
+                let places = at..at + count;
                 write_sorted_long(&row[..found], dropped, &mut senders[places.clone()]);
                 receivers[places].fill(MaybeUninit::new(i64::from(receiver)));
             }
@@ -252,10 +253,11 @@ unsafe fn fill(out: *mut [i64; LONGEST / 2], count: usize, value: i64) {
     const WHOLE: usize = LONGEST / 2;
     // SAFETY: promised by the caller.
     unsafe {
-        out.write_unaligned([value; WHOLE]);
+        out.write([value; WHOLE]);
+        // Asked for itself, since it is seldom so.
         if count > WHOLE {
             for block in 1..count.div_ceil(WHOLE) {
-                out.add(block).write_unaligned([value; WHOLE]);
+                out.add(block).write([value; WHOLE]);
             }
         }
     }

@@ -21,7 +21,8 @@ const WORTH: f64 = 5.0;
 /// Most cells in a group.
 const MOST_TOGETHER: f64 = 4.0;
 
-/// Above this many cells per particle (plus a constant) a grid stores occupied rows only.
+/// Above this many cells per particle (plus a constant), or more than an `i32` counts, a grid stores
+/// occupied rows only.
 const MOST_CELLS_PER_PARTICLE: usize = 16;
 
 /// The rows around a row, in three dimensions, twice where the x axis is periodic.
@@ -111,9 +112,10 @@ impl Axis {
     /// once are converted to.
     #[inline(always)]
     fn cell_of_few<T: Scalar>(&self, x: T) -> u32 {
+        debug_assert!(self.count <= i32::MAX as u64);
         let cell = (x.to_f64() - self.origin) * self.cells_per_length;
         let cell = cell.greater(0.0).lesser((self.count - 1) as f64);
-        // SAFETY: it is in range, as the larger of NaN and 0 is 0.
+        // SAFETY: NaN, of an endless extent, has become 0, and a dense grid has at most `i32::MAX` cells.
         (unsafe { cell.to_int_unchecked::<i32>() }) as u32
     }
 
@@ -289,7 +291,11 @@ impl<T: Scalar, const D: usize> Grid<T, D> {
         let boxes: f64 = self
             .axes
             .iter()
-            .map(|axis| ((D as f64).sqrt() / (axis.cells_per_length * radius)).ceil())
+            .map(|axis| {
+                ((D as f64).sqrt() / (axis.cells_per_length * radius))
+                    .ceil()
+                    .max(1.0)
+            })
             .product();
         let square = |n: usize| n as u64 * n as u64;
         let pairs: u64 = match &self.rows {
@@ -396,8 +402,8 @@ impl<T: Scalar, const D: usize> Cells<'_, T, D> {
         }
         let end = match rows {
             Rows::Dense { starts } => {
-                let cells = axes[0].count as usize;
-                let cell_start = |row: usize, x: u64| starts[row * cells + x as usize] as usize;
+                let length = axes[0].count as usize;
+                let cell_start = |row: usize, x: u64| starts[row * length + x as usize] as usize;
                 self.x = (self.x..)
                     .find(|&x| cell_start(self.row, x + 1) > start)
                     .expect("a row ends after its particles");

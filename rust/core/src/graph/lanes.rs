@@ -33,8 +33,8 @@ pub(super) trait Lanes<const BLOCK: usize>: Copy {
     ///
     /// # Safety
     /// They are distinct, smaller than [`NONE`](super::order::NONE) and at most
-    /// [`SHORT`](super::order::SHORT); `row` goes on for a block behind them, and `out` has room
-    /// for whole blocks of them, of the longest.
+    /// [`SHORT`](super::order::SHORT); `dropped` is one of them or `NONE`; `row` goes on for a block
+    /// behind them, and `out` has room for whole blocks of them, of the longest, and for one at least.
     unsafe fn write_sorted(self, row: &[i32], n: usize, dropped: i32, out: *mut i64);
 
     /// Tells that what lies at `place` will be read soon.

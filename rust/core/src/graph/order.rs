@@ -19,13 +19,13 @@ pub(super) fn write_sorted_long(row: &[i32], dropped: i32, out: &mut [MaybeUnini
     }
 }
 
-/// [`Lanes::write_sorted`] where each sender's place is the number of smaller ones, which `ranks`
+/// [`Lanes::write_sorted`](super::lanes::Lanes::write_sorted) where each sender's place is the number of smaller ones, which `ranks`
 /// tells for each of its first argument among its second. That is quadratic, but several
 /// comparisons go to an instruction, and no branch depends on their outcome.
 ///
 /// # Safety
-/// The senders are distinct, `row` goes on for a block behind them, and in `out` there is room for
-/// whole blocks of them.
+/// The senders are distinct, `dropped` is one of them or [`NONE`], `row` goes on for a block behind
+/// them, and in `out` there is room for whole blocks of them.
 #[inline(always)]
 pub(super) unsafe fn write_ranked<const BLOCK: usize>(
     row: &[i32],

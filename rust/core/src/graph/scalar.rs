@@ -44,7 +44,7 @@ pub trait Scalar:
     fn abs(self) -> Self;
     /// The smaller of two numbers that are not NaN.
     fn lesser(self, other: Self) -> Self;
-    /// The larger of two numbers that are not NaN.
+    /// The larger of two numbers; the other one where this is NaN.
     fn greater(self, other: Self) -> Self;
     /// Neither infinite nor NaN.
     fn is_finite(self) -> bool;

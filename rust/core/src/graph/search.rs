@@ -31,7 +31,8 @@ pub(super) struct Search<T, const D: usize> {
     period: [T; D],
     /// The largest squared cutoff.
     limit: T,
-    /// Where each particle has its own, those in cell order, with room for a block at the end.
+    /// Where each particle has its own, those in cell order, with room for a block at the end; else
+    /// empty.
     limits: Vec<T>,
 }
 
@@ -186,9 +187,9 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
         }
         let mut end = 0;
         for run in runs {
-            let mut copied = 0;
+            // One block at least, since few runs are longer.
+            let (mut from, mut to) = (run.start, end);
             loop {
-                let (from, to) = (run.start + copied, end + copied);
                 // SAFETY: there is room for a block behind the sorted particles and behind
                 // the candidates.
                 unsafe {
@@ -200,8 +201,8 @@ impl<T: Scalar, const D: usize> Candidates<T, D> {
                         copy_block::<BLOCK, _>(&search.limits, from, &mut self.limits, to);
                     }
                 }
-                copied += BLOCK;
-                if from + BLOCK >= run.end {
+                (from, to) = (from + BLOCK, to + BLOCK);
+                if from >= run.end {
                     break;
                 }
             }

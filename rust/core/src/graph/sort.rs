@@ -39,7 +39,7 @@ struct Particle<T, const D: usize> {
 }
 
 /// Sorts `positions`, whose caller's indices begin at `first`, into so many `cells`; `numbers`
-/// tells that of each in a range.
+/// tells the cell of each particle in a range.
 pub(super) fn sort_by_cell<T: Scalar, const D: usize>(
     positions: &[[T; D]],
     first: usize,

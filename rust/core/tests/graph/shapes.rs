@@ -156,3 +156,12 @@ fn extreme_extents_neither_hang_nor_panic() {
         radius_graph::<_, f64>(&case.particles(), Radius::Uniform(1.0), &case.options(1)).unwrap();
     assert_eq!(built.offsets, [0; 4]);
 }
+
+#[test]
+fn a_box_far_smaller_than_the_radius_is_no_crowd() {
+    let mut case = Case::open(2, vec![0.0; 6]);
+    case.period = Some(vec![1e-300; 2]);
+    let built =
+        radius_graph::<_, f64>(&case.particles(), Radius::Uniform(1e10), &case.options(1)).unwrap();
+    assert_eq!(built.edge_index, [1, 2, 0, 2, 0, 1, 0, 0, 1, 1, 2, 2]);
+}

@@ -50,14 +50,14 @@ impl Lanes<BLOCK> for Avx512 {
 
     #[inline(always)]
     unsafe fn write_sorted(self, row: &[i32], n: usize, dropped: i32, out: *mut i64) {
-        // SAFETY: promised by the caller.
+        // SAFETY: promised by the caller, and the processor has AVX-512, so AVX2 too.
         unsafe {
+            if n <= HALF {
+                let keys = __m512i::load(row.as_ptr(), n, dropped);
+                let keys = _mm512_castsi512_si256(keys).sorted();
+                return _mm512_storeu_si512(out.cast(), _mm512_cvtepi32_epi64(keys));
+            }
             match n.div_ceil(BLOCK) {
-                _ if n <= HALF => {
-                    let keys =
-                        _mm512_castsi512_si256(__m512i::load(row.as_ptr(), n, dropped)).sorted();
-                    _mm512_storeu_si512(out.cast(), _mm512_cvtepi32_epi64(keys));
-                }
                 1 => write_network::<__m512i, 1>(row, n, dropped, out),
                 2 => write_network::<__m512i, 2>(row, n, dropped, out),
                 _ => write_network::<__m512i, 4>(row, n, dropped, out),
