@@ -19,9 +19,9 @@ pub(super) fn write_sorted_long(row: &[i32], dropped: i32, out: &mut [MaybeUnini
     }
 }
 
-/// [`Lanes::write_sorted`](super::lanes::Lanes::write_sorted) where each sender's place is the number of smaller ones, which `ranks`
-/// tells for each of its first argument among its second. That is quadratic, but several
-/// comparisons go to an instruction, and no branch depends on their outcome.
+/// [`Lanes::write_sorted`](super::lanes::Lanes::write_sorted) where each sender's place is the number
+/// of smaller ones, which `ranks` tells for each of its first argument among its second. That is
+/// quadratic, but several comparisons go to an instruction, and no branch depends on their outcome.
 ///
 /// # Safety
 /// The senders are distinct, `dropped` is one of them or [`NONE`], `row` goes on for a block behind
